@@ -1,0 +1,110 @@
+#include "core/math/sampling.h"
+
+#include <algorithm>
+#include <array>
+
+#include "core/math/elementary.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr uint32_t ReverseBits(uint32_t x) {
+  x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
+  x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
+  x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
+  return __builtin_bswap32(x);
+}
+
+// Generator matrices of dimensions 0 to 3, from the primitive polynomials and initial direction
+// numbers of Joe and Kuo's table new-joe-kuo-6.
+constexpr std::array<std::array<uint32_t, 32>, 4> MakeDirections() {
+  std::array<std::array<uint32_t, 32>, 4> v{};
+  for (int i = 0; i < 32; ++i) v[0][i] = 1u << (31 - i);
+  struct Row {
+    int s;
+    uint32_t a;
+    std::array<uint32_t, 3> m;
+  };
+  constexpr Row rows[3] = {{1, 0, {1, 0, 0}}, {2, 1, {1, 3, 0}}, {3, 1, {1, 3, 1}}};
+  for (int d = 0; d < 3; ++d) {
+    const Row& r = rows[d];
+    auto& w = v[d + 1];
+    for (int i = 0; i < r.s; ++i) w[i] = r.m[i] << (31 - i);
+    for (int i = r.s; i < 32; ++i) {
+      w[i] = w[i - r.s] ^ (w[i - r.s] >> r.s);
+      for (int k = 1; k < r.s; ++k) w[i] ^= ((r.a >> (r.s - 1 - k)) & 1u) * w[i - k];
+    }
+  }
+  return v;
+}
+constexpr auto kDirections = MakeDirections();
+
+// Permutes the bits of x from the lowest up, each depending on those below it only.
+constexpr uint32_t LaineKarrasPermutation(uint32_t x, uint32_t seed) {
+  x ^= x * 0x3d20adeau;
+  x += seed;
+  x *= (seed >> 16) | 1u;
+  x ^= x * 0x05526c56u;
+  x ^= x * 0x53a22864u;
+  return x;
+}
+
+constexpr uint32_t NestedUniformScramble(uint32_t x, uint32_t seed) {
+  return ReverseBits(LaineKarrasPermutation(ReverseBits(x), seed));
+}
+
+}  // namespace
+
+uint32_t OwenSobolBits(uint32_t index, unsigned dimension, uint32_t seed) {
+  uint32_t x = 0;
+  for (uint32_t i = index, bit = 0; i != 0; i >>= 1, ++bit) {
+    x ^= (0u - (i & 1u)) & kDirections[dimension][bit];
+  }
+  return NestedUniformScramble(x, static_cast<uint32_t>(HashKey(seed, dimension)));
+}
+
+uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed) {
+  return NestedUniformScramble(index, seed);
+}
+
+Vec2f ConcentricDisc(float u, float v) {
+  const float a = 2.0f * u - 1.0f;
+  const float b = 2.0f * v - 1.0f;
+  if (a == 0.0f && b == 0.0f) return {0.0f, 0.0f};
+  float r, phi_rad;
+  if (std::fabs(a) > std::fabs(b)) {
+    r = a;
+    phi_rad = 0.78539816339744831f * (b / a);
+  } else {
+    r = b;
+    phi_rad = 1.57079632679489662f - 0.78539816339744831f * (a / b);
+  }
+  const SinCos sc = DetSinCos(phi_rad);
+  return {static_cast<float>(r * sc.cos), static_cast<float>(r * sc.sin)};
+}
+
+Vec3f CosineHemisphere(float u, float v) {
+  const Vec2f d = ConcentricDisc(u, v);
+  return {d.x, d.y, std::sqrt(std::max(0.0f, 1.0f - d.x * d.x - d.y * d.y))};
+}
+
+Vec3f UniformSphere(float u, float v) {
+  const float z = 1.0f - 2.0f * u;
+  const float r = std::sqrt(std::max(0.0f, 1.0f - z * z));
+  const SinCos sc = DetSinCos(2.0 * kPi * v);
+  return {static_cast<float>(r * sc.cos), static_cast<float>(r * sc.sin), z};
+}
+
+Vec2f UniformTriangle(float u, float v) {
+  if (v > u) {
+    u *= 0.5f;
+    v -= u;
+  } else {
+    v *= 0.5f;
+    u -= v;
+  }
+  return {u, v};
+}
+
+}  // namespace farpoint

@@ -1,0 +1,64 @@
+// Parameters of a render. What changes the image stands apart from what changes only the speed.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "core/base/status.h"
+#include "core/image/layers.h"
+
+namespace farpoint {
+
+enum class Integrator : uint32_t {
+  kFpbgi,  // factorized point-based GI [Wang et al. 2013]
+  kPbgi,   // point-based GI [Christensen 2008]: every receiver alone, from the root
+  kDpbgi,  // pbgi with a smaller microbuffer ("degraded", paper §4)
+  kPt,     // path tracing over the triangles: the ground truth
+};
+enum class BufferMap : uint32_t {
+  kOctahedral,  // the whole sphere, world-aligned
+  kCosine,      // the hemisphere about a receiver's normal, warped by the cosine (pbgi, dpbgi)
+};
+enum class Splat : uint32_t {
+  kCoverage,  // front to back, each node covers as much of a pixel as its solid angle
+  kOpaque,    // classic: a node fills the pixels that it touches, the nearest wins
+};
+
+struct RenderSettings {
+  // --- Changes the image ---
+  Integrator integrator = Integrator::kFpbgi;
+  uint32_t spp = 1;             // receivers per pixel, 1..256; 1: the pixel's centre
+  uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
+  uint32_t light_samples = 16;  // shadow rays per receiver or surfel and light, 1..4096
+  uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
+  uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default
+  BufferMap buffer_map = BufferMap::kOctahedral;
+  Splat splat = Splat::kCoverage;
+  uint32_t clusters = 0;        // k per block, 1..1024; 0: the default
+  float epsilon = 0.1f;         // far: R_cluster < epsilon (d - r); >= 0
+  float normal_weight = 0.1f;   // alpha / squared block diagonal (paper §3.1)
+  uint32_t kmeans_iterations = 5;  // 0..100
+  uint64_t seed = 0;
+  std::vector<Layer> layers = DefaultLayers();
+
+  // --- Changes only the speed ---
+  uint32_t tile_px = 128;  // a multiple of 32
+  bool no_skip = false;    // compute also what the scene does not need
+
+  // The value in force where 0 means "default".
+  uint32_t microbuffer_px() const;
+  uint32_t clusters_per_block() const;
+};
+
+// kInvalidArgument names the setting, its value and what is allowed.
+absl::Status ValidateSettings(const RenderSettings& settings);
+
+// Every parameter as in the paper (DESIGN §8): 32x32 blocks, k = 100, epsilon = 0.1, opaque splats,
+// depth composite, 5 iterations, 24x24 buffers.
+void ApplyPaperPreset(RenderSettings& settings);
+
+absl::StatusOr<Integrator> IntegratorFromName(std::string_view name);
+std::string_view NameOf(Integrator integrator);
+
+}  // namespace farpoint

@@ -1,0 +1,139 @@
+// The prepared scene: what rays and shading need, flattened to world space, as one immutable blob
+// that coordinator and workers share by its SHA-256 (byte format: docs/protocol.md).
+//
+// Positions are float offsets from `origin` (the centre of the world bounding box, in double), so
+// that a scene far from zero loses no precision. Triangles of degenerate area are kept out.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "core/base/blob.h"
+#include "core/base/executor.h"
+#include "core/base/status.h"
+#include "core/scene/scene.h"
+
+namespace farpoint {
+
+// Indices into PreparedScene::vertices().
+struct PreparedTriangle {
+  std::array<uint32_t, 3> vertex;
+  uint32_t object;  // index into objects()
+};
+
+// A run of triangles that came from one instance of one mesh.
+struct PreparedObject {
+  uint64_t first_triangle, triangle_count;
+  uint32_t material;
+  uint32_t has_normals;   // 1: vertex normals are valid; 0: flat
+  uint64_t content_key;   // hash of the mesh's geometry and the instance's linear transform: seeds
+                          // sampling, unchanged when the object only moves or its peers change
+};
+
+struct PreparedMaterial {
+  Rgb base_color;
+  float alpha_cutoff;          // < 0: opaque
+  Rgb emission;
+  float base_alpha;
+  int32_t base_color_texture;  // -1: none
+  int32_t emission_texture;
+  uint32_t base_color_uv_set, emission_uv_set;
+  float base_color_uv[6];      // rows of the 2x3 matrix on (u, v, 1)
+  float emission_uv[6];
+};
+
+struct PreparedTexture {
+  uint64_t first_texel;  // into texels()
+  uint32_t width, height;
+  uint32_t wrap_s, wrap_t;  // WrapMode
+  uint32_t nearest;
+  uint32_t reserved;
+};
+
+struct PreparedLight {
+  uint32_t kind;  // PunctualKind
+  Vec3f position;   // relative to origin
+  Vec3f direction;  // unit, the way the light travels
+  Rgb intensity;
+  float range_m;    // 0: infinite
+  float cos_inner, cos_outer;
+  float reserved;
+};
+
+// Alpha and emission aside, what a shading point needs.
+struct SurfaceSample {
+  Rgb albedo;    // linear
+  Rgb emission;  // radiance
+  float alpha;   // 1 unless the material is a mask
+};
+
+class PreparedScene {
+ public:
+  // Flattens, decodes the textures that are used, drops degenerate triangles, checks that all is
+  // finite. kInvalidArgument names mesh and instance, kResourceExhausted a limit.
+  static absl::StatusOr<std::shared_ptr<const PreparedScene>> Prepare(const Scene& scene,
+                                                                      Executor& executor);
+  // Reads a blob; every offset and index is checked. kDataLoss says what and where. The blob is
+  // kept and viewed in place.
+  static absl::StatusOr<std::shared_ptr<const PreparedScene>> FromBlob(Blob blob);
+
+  const Blob& blob() const { return blob_; }
+
+  const Vec3d& origin() const { return origin_; }   // world
+  const Box3f& bounds() const { return bounds_; }   // relative to origin
+  float diagonal_m() const { return diagonal_m_; }  // of bounds(); 0 if there are no triangles
+
+  std::span<const Vec3f> vertices() const { return vertices_; }  // relative to origin
+  std::span<const Vec3f> normals() const { return normals_; }    // unit; one per vertex
+  std::span<const Vec2f> uvs(unsigned set) const { return uv_[set]; }  // empty or one per vertex
+  std::span<const PreparedTriangle> triangles() const { return triangles_; }
+  std::span<const PreparedObject> objects() const { return objects_; }
+  std::span<const PreparedMaterial> materials() const { return materials_; }
+  std::span<const PreparedTexture> textures() const { return textures_; }
+  std::span<const PreparedLight> lights() const { return lights_; }
+  const Rgb& sky() const { return sky_; }
+  // Objects are two-sided; a scene is lit if it has a light with power, an emitter or a sky.
+  bool has_alpha_masks() const { return has_alpha_masks_; }
+  // Triangles whose material emits (emission > 0 in some channel), ascending.
+  std::span<const uint32_t> emissive_triangles() const { return emissive_triangles_; }
+
+  const PreparedMaterial& MaterialOf(uint32_t triangle) const {
+    return materials_[objects_[triangles_[triangle].object].material];
+  }
+  // Unit geometric normal by the winding; area in m². Computed in double, rounded once.
+  Vec3f GeometricNormal(uint32_t triangle) const;
+  float TriangleArea(uint32_t triangle) const;
+  // b1, b2: barycentric weights of vertices 1 and 2.
+  Vec3f PointOn(uint32_t triangle, float b1, float b2) const;
+  // Interpolated and normalised, on the side of the geometric normal; the geometric normal where
+  // the mesh has none.
+  Vec3f ShadingNormal(uint32_t triangle, float b1, float b2) const;
+  SurfaceSample Surface(uint32_t triangle, float b1, float b2) const;
+  float Alpha(uint32_t triangle, float b1, float b2) const;
+
+ private:
+  PreparedScene() = default;
+  Rgb SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const;
+
+  Blob blob_;
+  Vec3d origin_;
+  Box3f bounds_;
+  float diagonal_m_ = 0;
+  std::span<const Vec3f> vertices_, normals_;
+  std::array<std::span<const Vec2f>, 2> uv_;
+  std::span<const PreparedTriangle> triangles_;
+  std::span<const PreparedObject> objects_;
+  std::span<const PreparedMaterial> materials_;
+  std::span<const PreparedTexture> textures_;
+  std::span<const uint32_t> texels_;  // RGBA8, sRGB-encoded colour, linear alpha, R lowest byte
+  std::span<const PreparedLight> lights_;
+  std::vector<uint32_t> emissive_triangles_;
+  Rgb sky_;
+  bool has_alpha_masks_ = false;
+};
+
+}  // namespace farpoint

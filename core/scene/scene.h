@@ -1,0 +1,107 @@
+// The scene as a user describes it, whatever file it came from: meshes, instances, materials,
+// textures, lights, cameras. World frame: right-handed, y up (glTF's), metres. Radiance in
+// W/(m² sr), irradiance in W/m², both scene-linear Rec. 709. Plain data, no behaviour.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "core/base/blob.h"
+#include "core/math/affine.h"
+#include "core/math/vec.h"
+
+namespace farpoint {
+
+enum class WrapMode : uint32_t { kRepeat, kMirroredRepeat, kClampToEdge };
+
+// An image as it was in the file; decoded by PrepareScene and only if a material needs it.
+struct Texture {
+  std::string name;  // for messages: the URI or "image 3"
+  Blob encoded;      // PNG, JPEG, … bytes
+  WrapMode wrap_s = WrapMode::kRepeat;
+  WrapMode wrap_t = WrapMode::kRepeat;
+  bool nearest = false;  // magnification without interpolation
+};
+
+enum class AlphaMode : uint32_t { kOpaque, kMask };
+
+// uv' = offset + R(rotation) * (scale * uv) (KHR_texture_transform)
+struct UvTransform {
+  Vec2f offset{0, 0};
+  Vec2f scale{1, 1};
+  float rotation_rad = 0;
+};
+
+struct TextureRef {
+  int32_t texture = -1;  // index into Scene::textures; -1: none
+  uint32_t uv_set = 0;   // 0 or 1
+  UvTransform transform;
+  bool present() const { return texture >= 0; }
+};
+
+struct Material {
+  std::string name;
+  Rgb base_color{1, 1, 1};  // linear, [0, 1]; Lambert albedo
+  float base_alpha = 1;
+  TextureRef base_color_texture;  // sRGB, multiplies base_color and base_alpha
+  AlphaMode alpha_mode = AlphaMode::kOpaque;
+  float alpha_cutoff = 0.5f;  // kMask: a point with alpha below it is a hole
+  Rgb emission;               // radiance, emitted from both sides (all surfaces are two-sided)
+  TextureRef emission_texture;  // sRGB, multiplies emission
+  float metallic = 1, roughness = 1;  // read and kept; every material is Lambert for now
+};
+
+// One primitive: triangles of one material.
+struct Mesh {
+  std::string name;
+  std::vector<Vec3f> positions;            // mesh frame
+  std::vector<Vec3f> normals;              // empty: flat; else one per position, any length
+  std::array<std::vector<Vec2f>, 2> uv;    // each empty or one per position
+  std::vector<std::array<uint32_t, 3>> triangles;
+  int32_t material = -1;                   // -1: white Lambert, albedo 1 (the glTF default)
+};
+
+struct Instance {
+  std::string name;
+  uint32_t mesh = 0;
+  Affine world_from_mesh;
+};
+
+enum class PunctualKind : uint32_t { kPoint, kSpot, kDirectional };
+
+struct PunctualLight {
+  std::string name;
+  PunctualKind kind = PunctualKind::kPoint;
+  Vec3d position;        // world; point and spot
+  Vec3d direction;       // world, unit, the way the light travels; spot and directional
+  Rgb intensity;         // point, spot: W/sr. directional: irradiance on a facing surface, W/m²
+  double range_m = 0;    // 0: infinite (glTF's range; window (1 - (d/range)^4) clamped to [0, 1])
+  double inner_cone_rad = 0, outer_cone_rad = 0.7853981633974483;  // spot, glTF's falloff
+};
+
+// A perspective pinhole.
+struct Camera {
+  std::string name;
+  Vec3d eye;                       // world
+  Vec3d right{1, 0, 0}, up{0, 1, 0}, forward{0, 0, -1};  // orthonormal, world
+  double yfov_rad = 0.7;           // of the whole frame's height
+};
+
+struct Environment {
+  Rgb sky;  // constant radiance from all directions that leave the scene; zero: none
+};
+
+struct Scene {
+  std::string name;
+  std::vector<Texture> textures;
+  std::vector<Material> materials;
+  std::vector<Mesh> meshes;
+  std::vector<Instance> instances;
+  std::vector<PunctualLight> lights;
+  std::vector<Camera> cameras;
+  Environment environment;
+};
+
+}  // namespace farpoint
