@@ -2,6 +2,7 @@
 // .cc files.
 #pragma once
 
+#include <array>
 #include <map>
 #include <string>
 #include <vector>
@@ -12,15 +13,18 @@
 namespace farpoint {
 
 struct ExrMetadata {
-  std::map<std::string, std::string> strings;       // e.g. "farpoint:version"
-  std::map<std::string, std::array<float, 16>> matrices;  // row-major: worldToCamera, worldToNDC
+  std::map<std::string, std::string> strings;  // e.g. "farpoint:version"
+  // worldToCamera, worldToNDC: row-major, as the file stores them. OpenEXR multiplies row vectors
+  // from the left (p_camera = p_world * M), so the translation stands in elements 12 to 14.
+  std::map<std::string, std::array<float, 16>> matrices;
 };
 
 enum class ExrCompression { kNone, kZip, kPiz };
 
 // displayWindow: the whole frame; dataWindow: the film's rectangle (inclusive). Channels as in
-// layers.h, Rec. 709 chromaticities, ZIP scanlines unless told. Written to `path`.part, flushed,
-// renamed.
+// layers.h, Rec. 709 chromaticities, scanlines from the top down. Halves and floats are stored as
+// Film::RoundToStorage() leaves them, bit by bit. Written to `path`.part, flushed, renamed.
+// kInvalidArgument for a film that leaves the frame or has no layer.
 absl::Status WriteExr(const std::string& path, const Film& film, int frame_width, int frame_height,
                       const ExrMetadata& metadata, ExrCompression compression);
 
@@ -31,16 +35,21 @@ struct ExrChannel {
   std::vector<float> values;  // height x width of the dataWindow
 };
 struct ExrImage {
-  PixelRect data_window;  // half-open
+  PixelRect data_window;  // half-open; (0, 0) is the upper left pixel of the displayWindow
   int frame_width = 0, frame_height = 0;
   std::vector<ExrChannel> channels;
   ExrMetadata metadata;
+  // By the full name ("irradiance.R"); null if the file has no such channel.
   const ExrChannel* Find(const std::string& name) const;
 };
-// Any scanline or tiled single-part file. kInvalidArgument, kNotFound or kDataLoss name the file.
+// Any scanline or tiled single-part file without subsampled channels. Damaged and incomplete files
+// are refused as a whole. kInvalidArgument, kNotFound, kDataLoss or kResourceExhausted name the
+// file and the cause. Thread-safe.
 absl::StatusOr<ExrImage> ReadExr(const std::string& path);
 
 // The film that a file of ours holds: every known layer whose channels are all there.
+// kInvalidArgument if there is none, or if a channel is stored in another precision than ours.
+// ImageHash(FilmFromExr(ReadExr(f))) is the hash of the film that was written to f.
 absl::StatusOr<Film> FilmFromExr(const ExrImage& image);
 
 // 8-bit sRGB of the beauty, each value times 2^exposure_stops, clamped to [0, 1].

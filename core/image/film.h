@@ -33,8 +33,8 @@ class Film {
   // Copies the pixels of `other` that lie inside this film; the layers must be the same.
   void Paste(const Film& other);
 
-  // Rounds every value to what its layer stores (half layers to binary16), so that hashes and
-  // files agree. Idempotent.
+  // Rounds every value to what its layer stores (half layers to binary16, -0 to +0), so that hashes
+  // and files agree. Idempotent. NaN and infinities stay what they are: DecodeFilm refuses them.
   void RoundToStorage();
 
  private:
@@ -48,7 +48,9 @@ class Film {
 // per layer, per block in raster order, channels in order, rows top down; halves where the layer
 // stores halves. Lossless for a film that was rounded to storage. Format: docs/protocol.md.
 std::vector<std::byte> EncodeFilm(const Film& film);
-// kDataLoss for anything that is not exactly such a record. Sizes are checked before allocation.
+// kDataLoss for anything that is not exactly such a record (encoding the result gives the same
+// bytes), and for values that no kernel may produce: NaN, -0, infinities except +inf in kDepth.
+// Sizes are checked before allocation.
 absl::StatusOr<Film> DecodeFilm(std::span<const std::byte> bytes);
 
 // DESIGN §4. The hash of a block of a layer is SHA-256 over its stored values; a film's layer hash

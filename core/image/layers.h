@@ -13,27 +13,27 @@
 namespace farpoint {
 
 enum class Layer : uint32_t {
-  kBeauty,      // R,G,B,A: direct + indirect + emission; A is the covered part of the pixel
-  kDirect,      // radiance from reflected direct light
-  kIndirect,    // radiance from reflected indirect light
-  kEmission,    // emitted radiance; the background's too
-  kAlbedo,      // Lambert reflectance
-  kNormal,      // N.X N.Y N.Z: shading normal, world, unit, towards the viewer; 0: background
-  kPosition,    // P.X P.Y P.Z: world, metres; 0: background
-  kDepth,       // Z: distance along the camera's axis, metres; +inf: background
-  kIrradiance,  // indirect irradiance E before the albedo, W/m²
+  kBeauty,            // R,G,B,A: direct + indirect + emission; A is the covered part of the pixel
+  kDirect,            // radiance from reflected direct light
+  kIndirect,          // radiance from reflected indirect light
+  kEmission,          // emitted radiance; the background's too
+  kAlbedo,            // Lambert reflectance
+  kNormal,            // N.X N.Y N.Z: shading normal, world, unit, towards the viewer; 0: background
+  kPosition,          // P.X P.Y P.Z: world, metres; 0: background
+  kDepth,             // Z: distance along the camera's axis, metres; +inf: background
+  kIrradiance,        // indirect irradiance E before the albedo, W/m²
   kDirectIrradiance,  // direct irradiance E, W/m²
-  kStdError,    // standard error of kIrradiance (pt only)
-  kCluster,     // index of the receiver's cluster within its block, averaged over samples; -1: none
-  kCutSize,     // nodes in the receiver's own cut, mean over samples
+  kStdError,          // standard error of kIrradiance (pt only)
+  kCluster,  // index of the receiver's cluster within its block, averaged over samples; -1: none
+  kCutSize,  // nodes in the receiver's own cut, mean over samples
 };
 inline constexpr int kLayerCount = 13;
 
 struct LayerInfo {
   Layer layer;
-  std::string_view name;                 // as in --aov and in the EXR: "name.R"
+  std::string_view name;                       // as in --aov and in the EXR: "name.R"
   std::span<const std::string_view> channels;  // full EXR channel names, in fixed order
-  bool half;                             // stored as binary16, else as binary32
+  bool half;                                   // stored as binary16, else as binary32
   bool on_by_default;
 };
 
