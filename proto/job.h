@@ -1,0 +1,238 @@
+// The service's vocabulary as plain values: what client, coordinator and worker say to each other,
+// whether over a wire (proto/convert.h) or within one process. No protobuf, no gRPC.
+#pragma once
+
+#include <array>
+#include <chrono>
+#include <compare>
+#include <cstdint>
+#include <functional>
+#include <map>
+#include <optional>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include "core/base/blob.h"
+#include "core/base/hash.h"
+#include "core/base/stats.h"
+#include "core/base/status.h"
+#include "core/image/tile_rect.h"
+#include "core/math/vec.h"
+#include "core/render/frame_renderer.h"
+#include "core/render/settings.h"
+#include "core/scene/importer.h"
+
+namespace farpoint {
+
+// Raised whenever an older peer would misunderstand a newer one. Checked at Submit and Register.
+inline constexpr uint32_t kProtocolVersion = 1;
+// Bulk data travel in pieces of this size; nobody sends or accepts larger ones.
+inline constexpr size_t kChunkBytes = size_t{1} << 20;
+
+// Identifiers that cannot be mixed up.
+template <typename Tag>
+struct Id {
+  std::string value;
+  auto operator<=>(const Id&) const = default;
+  bool empty() const { return value.empty(); }
+};
+using JobId = Id<struct JobIdTag>;        // 8 hexadecimal digits, chosen by the coordinator
+using WorkerId = Id<struct WorkerIdTag>;  // valid for one registration
+using LeaseId = Id<struct LeaseIdTag>;
+
+// --- The job ---------------------------------------------------------------------------------
+
+struct LookAt {
+  Vec3d eye, target;     // world, metres; different points
+  Vec3d up{0, 1, 0};     // any length, not parallel to target - eye
+  double yfov_deg = 45;  // of the whole frame's height, (0, 180)
+};
+struct CameraName {
+  std::string name;
+};
+// monostate: the scene's first camera, or one made up if it has none.
+using CameraChoice = std::variant<std::monostate, CameraName, LookAt>;
+
+struct SunOverride {
+  Vec3d to_sun;    // from the scene to the sun, any length but zero
+  Rgb irradiance;  // on a facing surface, W/m²
+};
+struct SceneOverrides {
+  std::vector<SunOverride> suns;  // not empty: in place of the scene's punctual lights
+  std::optional<Rgb> sky;         // radiance, in place of the scene's sky
+  std::optional<Rgb> albedo;      // of every material, [0, 1]; base-colour textures are left out
+};
+
+// What a job may use at most. The coordinator has limits of its own; the smaller one wins.
+struct JobLimits {
+  uint64_t max_pixels = uint64_t{1} << 30;       // of the crop
+  uint64_t max_asset_bytes = uint64_t{1} << 36;  // all files together
+  uint64_t max_triangles = 200'000'000;          // after instancing
+  uint64_t max_surfels = uint64_t{1} << 31;
+  uint64_t max_seconds = uint64_t{30} * 24 * 3600;  // from the start of rendering to the end
+  bool operator==(const JobLimits&) const = default;
+};
+JobLimits Smaller(const JobLimits& a, const JobLimits& b);
+
+struct JobSpec {
+  std::string asset_root;                     // key of the main file in asset_files
+  std::map<std::string, Digest> asset_files;  // by URI
+  RenderSettings settings;
+  FilmSpec film;  // width 0: not given yet (a job file may leave it to the command line)
+  CameraChoice camera;
+  SceneOverrides overrides;
+  LightUnits light_units = LightUnits::kPhotometric;
+  JobLimits limits;
+  std::string title;     // at most 200 bytes
+  int32_t priority = 0;  // higher goes first, -1000..1000
+};
+
+// Everything that can be known without the scene: settings, film, camera, overrides, limits, and
+// that the asset names its root among its files. kInvalidArgument names the field and what is
+// allowed; kResourceExhausted the limit that the film exceeds.
+absl::Status ValidateJob(const JobSpec& job);
+
+// The camera that `choice` means in `scene`: kNotFound lists the scene's cameras if the name is
+// not among them; kInvalidArgument if a LookAt has no direction.
+absl::StatusOr<Camera> ResolveCamera(const CameraChoice& choice, const Scene& scene);
+
+// Replaces what `overrides` names.
+void ApplyOverrides(const SceneOverrides& overrides, Scene& scene);
+
+// --- What is known about a job ---------------------------------------------------------------
+
+enum class JobState : uint32_t { kQueued, kBaking, kRendering, kDone, kFailed, kCancelled };
+std::string_view NameOf(JobState state);  // "queued", "baking", …
+inline bool IsFinal(JobState s) {
+  return s == JobState::kDone || s == JobState::kFailed || s == JobState::kCancelled;
+}
+
+// queued + leased + committed + failed = total, at any time.
+struct TileCounts {
+  uint32_t queued = 0, leased = 0, committed = 0, failed = 0, total = 0;
+  bool operator==(const TileCounts&) const = default;
+};
+
+struct JobStatus {
+  JobId id;
+  std::string title;
+  JobState state = JobState::kQueued;
+  TileCounts tiles;
+  uint64_t reissued = 0;         // leases lost, so that their tiles were queued again
+  uint64_t refused_results = 0;  // stale or damaged
+  std::optional<double> eta_s;
+  absl::Status error;  // of a failed job; OK otherwise
+  int32_t priority = 0;
+  double progress = 0;  // [0, 1]; tiles in work count by their progress
+  int64_t submitted_unix_ms = 0;
+};
+
+struct WorkerStatus {
+  WorkerId id;
+  std::string name, version;
+  uint32_t threads = 0;
+  Digest fingerprint;
+  uint32_t leases = 0;     // tiles that it works on
+  uint64_t committed = 0;  // tiles
+  uint64_t failures = 0;
+  bool set_aside = false;
+  double idle_s = 0;  // since it was last heard of
+};
+
+struct TileCommitted {
+  uint32_t tile = 0;
+  Digest sha256;  // of its bytes
+};
+// monostate: a passing report of progress.
+using JobEventBody = std::variant<std::monostate, JobState, TileCommitted, std::string>;
+struct JobEvent {
+  uint64_t sequence = 0;  // from 1, without gaps; 0 for a passing report, which is not kept
+  JobEventBody body;      // the string is a note for the user
+  JobStatus status;       // when it was sent
+};
+
+struct SceneBlobs {
+  Digest prepared_scene;
+  Digest tree_topology;  // empty: the integrator needs none
+  Digest tree_radiance;
+  bool operator==(const SceneBlobs&) const = default;
+};
+
+struct TileInfo {
+  PixelRect rect;
+  Digest sha256;  // empty until it is committed
+};
+// Row-major 4x4, row vectors (OpenEXR's convention): ndc = (x, y, z, 1) * world_to_ndc.
+struct CameraMatrices {
+  std::array<float, 16> world_to_camera{}, world_to_ndc{};
+};
+CameraMatrices MatricesOf(const Camera& camera, const FilmSpec& film);
+
+// What a client must know to stitch and to write an image.
+struct JobInfo {
+  JobStatus status;
+  JobSpec spec;
+  std::vector<TileInfo> tiles;  // in tile order; empty before the bake has finished
+  CameraMatrices camera;        // all zero before the bake has finished
+  Stats stats;                  // of the bake and of all committed tiles, added in tile order
+  std::vector<std::string> notes;
+  SceneBlobs blobs;
+  std::string version;  // of the coordinator
+};
+
+// The bytes of a committed tile: EncodeFilm of exactly its rectangle and the job's layers.
+struct TileData {
+  uint32_t tile = 0;
+  Digest sha256;
+  Blob bytes;
+};
+
+// --- Between coordinator and worker ----------------------------------------------------------
+
+struct WorkerHello {
+  std::string version;  // of farpoint
+  Digest fingerprint;
+  uint32_t threads = 1;
+  std::string name;  // for people, at most 200 bytes
+};
+struct WorkerWelcome {
+  WorkerId id;
+  std::chrono::milliseconds heartbeat{1000};  // how often to renew
+  std::chrono::milliseconds max_wait{10000};  // of one Lease call
+};
+
+struct TileWork {
+  LeaseId lease;
+  uint32_t attempt = 0;  // of this tile, from 1
+  JobId job;
+  uint32_t tile = 0;
+  PixelRect rect;
+  FrameSpec frame;
+  SceneBlobs blobs;
+  std::chrono::milliseconds lease_time{0};  // lost if progress stops for so long
+};
+
+struct LeaseProgress {
+  uint64_t counter = 0;  // grows while work is done
+  float fraction = 0;    // [0, 1] of the tile, for people
+};
+// Whether to go on after a heartbeat, and whether a result was taken.
+struct RenewAnswer {
+  bool drop = false;
+  std::string reason;
+};
+struct ReturnAnswer {
+  bool accepted = false;
+  std::string reason;
+};
+
+struct TileResult {
+  LeaseId lease;
+  uint32_t attempt = 0;
+  Digest sha256;  // of `bytes`
+  Blob bytes;     // EncodeFilm
+  Stats stats;
+};
+
+}  // namespace farpoint
