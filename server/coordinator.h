@@ -1,0 +1,164 @@
+// The coordinator: takes jobs, bakes their scenes, hands out tiles, keeps results. No sockets: the
+// gRPC services (server/*_service.cc) and the embedded mode call the same methods.
+//
+// Embedded use (`farpoint render`), everything in one process and nothing on disk:
+//
+//   CoordinatorOptions options;                       // no store directory: all in memory
+//   options.baker = MakeCoreBaker(threads);           // server/scene_baker.h
+//   FP_ASSIGN_OR_RETURN(auto coordinator, Coordinator::Open(std::move(options)));
+//   InProcessLink<CoordinatorApi> link(*coordinator); // worker/in_process_link.h
+//   WorkerOptions worker_options;                     // threads, name; see worker/worker.h
+//   worker_options.fingerprint = …                    // any fixed digest will do in one process
+//   Worker worker(worker_options, link, link, *MakeCoreRenderer());   // worker/tile_renderer.h
+//   std::thread thread([&] { worker.Run(); });        // until worker.Stop()
+//   for (auto& [uri, blob] : asset.files) coordinator->PutBlob(blob.Hash(), blob);
+//   FP_ASSIGN_OR_RETURN(JobId job, coordinator->Submit(spec, /*submission_id=*/""));
+//   for (uint64_t after = 0;;) {                      // until a final JobState event
+//     FP_ASSIGN_OR_RETURN(auto events, coordinator->NextEvents(job, after, 200ms));
+//     for (const JobEvent& e : events) {
+//       if (e.sequence != 0) after = e.sequence;      // TileCommitted: FetchTile, DecodeFilm,
+//       Paste
+//     }
+//   }
+//   worker.Stop(); thread.join();                     // before the coordinator is destroyed
+//
+// A gRPC client uses the same order of calls on v1::BlobService and v1::JobService.
+//
+// Errors: kNotFound for an id that is not known (also: after a purge), kInvalidArgument for
+// arguments that the header of proto/job.h or proto/convert.h forbids, kUnavailable while the store
+// cannot be written or the coordinator drains. All methods are thread-safe; those that wait say so.
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "core/base/blob.h"
+#include "core/base/clock.h"
+#include "core/base/hash.h"
+#include "core/base/status.h"
+#include "proto/job.h"
+
+namespace farpoint {
+
+class SceneBaker;  // server/scene_baker.h
+
+// A blob that arrives in pieces. One thread at a time.
+class BlobWriter {
+ public:
+  virtual ~BlobWriter() = default;  // without Commit(): what was written is dropped
+  // kInvalidArgument if more arrives than was announced.
+  virtual absl::Status Append(std::span<const std::byte> data) = 0;
+  // Makes the blob durable. kDataLoss if size or hash differ from what was announced.
+  virtual absl::Status Commit() = 0;
+};
+
+class CoordinatorApi {
+ public:
+  virtual ~CoordinatorApi() = default;
+
+  // --- Blobs ---
+  virtual absl::StatusOr<std::vector<Digest>> FindMissing(std::span<const Digest> digests) = 0;
+  // Keeps `blob` under `digest`, which must be its hash (kDataLoss). Harmless if it is there.
+  virtual absl::Status PutBlob(const Digest& digest, const Blob& blob) = 0;
+  // The same in pieces. kResourceExhausted if `size_bytes` is over the limit.
+  virtual absl::StatusOr<std::unique_ptr<BlobWriter>> StartPut(const Digest& digest,
+                                                               uint64_t size_bytes) = 0;
+  // Its hash was verified. kNotFound; kDataLoss if the store was damaged (the blob is dropped, so
+  // that it is found missing and sent again).
+  virtual absl::StatusOr<Blob> GetBlob(const Digest& digest) = 0;
+
+  // --- Jobs ---
+  // `submission_id`: a repeated one (not empty) answers with the same job, so that a client may
+  // submit again after a lost answer. kFailedPrecondition lists blobs of the asset that are
+  // missing. The job is durable when this returns.
+  virtual absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) = 0;
+  virtual absl::StatusOr<JobStatus> Status(const JobId& job) = 0;
+  virtual std::vector<JobStatus> Jobs() = 0;  // in the order of submission
+  virtual std::vector<WorkerStatus> Workers() = 0;
+  // Harmless if the job has ended.
+  virtual absl::Status Cancel(const JobId& job) = 0;
+  // Events with sequence > `after_sequence`, in order, at most 256. Waits up to `wait` for one; if
+  // none comes, a single passing report of progress (sequence 0). The last event of a job is its
+  // final JobState; asking for what follows it answers with an empty list at once.
+  virtual absl::StatusOr<std::vector<JobEvent>> NextEvents(const JobId& job,
+                                                           uint64_t after_sequence,
+                                                           std::chrono::milliseconds wait) = 0;
+  virtual absl::StatusOr<JobInfo> FetchInfo(const JobId& job) = 0;
+  // kFailedPrecondition if the tile is not committed.
+  virtual absl::StatusOr<TileData> FetchTile(const JobId& job, uint32_t tile) = 0;
+
+  // --- Workers ---
+  // kFailedPrecondition if the versions differ.
+  virtual absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) = 0;
+  // Waits up to `wait` for a tile. kNotFound: register again.
+  virtual absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
+                                                        std::chrono::milliseconds wait) = 0;
+  virtual absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
+                                            const LeaseProgress& progress) = 0;
+  // When it answers `accepted`, the tile is durable. A refusal (lease lost, another copy was
+  // faster, hash or contents wrong) is an answer, not an error.
+  virtual absl::StatusOr<ReturnAnswer> Return(const WorkerId& worker, const TileResult& result) = 0;
+  // `given_back`: nothing is wrong, the worker leaves; else `error` says what went wrong.
+  virtual absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
+                                     const absl::Status& error) = 0;
+  virtual absl::Status Leave(const WorkerId& worker) = 0;
+};
+
+// What a caller may want to log; called with no lock held by the callee's caller, from any thread.
+struct CoordinatorLogEntry {
+  enum class Level { kInfo, kWarning, kError } level = Level::kInfo;
+  std::string text;
+  JobId job;  // may be empty
+  std::optional<uint32_t> tile;
+  uint32_t attempt = 0;  // 0: none
+  WorkerId worker;       // may be empty
+};
+
+struct CoordinatorOptions {
+  // Everything that must survive lies below it; created if absent. Empty: all in memory.
+  std::string store_directory;
+  std::shared_ptr<SceneBaker> baker;  // required
+  JobLimits limits;                   // of every job
+  uint64_t max_blob_bytes = uint64_t{1} << 36;
+
+  // A lease is lost when nothing was heard of its worker for silence_time, or when its progress
+  // stood still for lease_time.
+  std::chrono::milliseconds silence_time{5000};
+  std::chrono::milliseconds lease_time{120000};
+  std::chrono::milliseconds heartbeat{1000};  // how often workers shall renew
+  // A tile is copied to an idle worker when it takes this many times the job's median, and at
+  // least speculate_after.
+  double speculate_factor = 3;
+  std::chrono::milliseconds speculate_after{5000};
+  uint32_t max_dead_workers = 3;     // different workers that a tile may take down
+  uint32_t max_tile_failures = 6;    // by whomever
+  uint32_t max_worker_failures = 3;  // in a row, then the worker is set aside for …
+  std::chrono::milliseconds set_aside_time{60000};
+  // Jobs that ended so long ago are purged with their tiles, and blobs that no job needs any more.
+  std::chrono::hours retention{24 * 7};
+
+  std::function<void(const CoordinatorLogEntry&)> log;  // may be empty
+  std::shared_ptr<const Clock> clock;                   // none: SteadyClock
+};
+
+class Coordinator : public CoordinatorApi {
+ public:
+  // Opens the store and takes up where the last process left off: what was committed stays, all
+  // other tiles of unfinished jobs are queued again. kFailedPrecondition if another process has the
+  // store or a newer version wrote it; kDataLoss, kUnavailable name the file.
+  static absl::StatusOr<std::unique_ptr<Coordinator>> Open(CoordinatorOptions options);
+
+  // Refuses new leases and submissions (kUnavailable), lets renewals and returns through. Wakes all
+  // who wait.
+  virtual void Drain() = 0;
+  // Leases that workers hold now.
+  virtual uint32_t ActiveLeases() = 0;
+};
+
+}  // namespace farpoint

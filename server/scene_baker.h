@@ -1,0 +1,43 @@
+// From the files of an asset to what workers need: the step between Submit and the first tile.
+#pragma once
+
+#include <atomic>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "core/base/hash.h"
+#include "core/base/stats.h"
+#include "core/base/status.h"
+#include "core/render/bake.h"
+#include "core/scene/asset.h"
+#include "proto/job.h"
+
+namespace farpoint {
+
+struct BakeResult {
+  BakedScene blobs;
+  Camera camera;                   // the job's choice, resolved
+  std::vector<std::string> notes;  // one line each
+  Stats stats;
+};
+
+// Thread-safe.
+class SceneBaker {
+ public:
+  virtual ~SceneBaker() = default;
+  // `cancel` is looked at between the stages: kCancelled. Limits of `spec` that the scene exceeds
+  // are kResourceExhausted; whatever is wrong with the scene is kInvalidArgument or kNotFound.
+  virtual absl::StatusOr<BakeResult> Bake(const AssetBundle& asset, const JobSpec& spec,
+                                          const std::atomic<bool>& cancel) = 0;
+};
+
+// import -> overrides -> camera and light -> Bake, on `threads` threads (0: all cores).
+std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads);
+
+// What decides a bake's blobs and nothing else: the asset's files, overrides, light units, the
+// settings that Bake reads, and this version. Jobs with equal keys share their blobs. Settings that
+// only the tiles need are left out by name, so that a new one counts until it is known to be free.
+Digest BakeKey(const JobSpec& spec);
+
+}  // namespace farpoint
