@@ -1,0 +1,59 @@
+// The command line as a value. The only include of CLI11 is in the .cc.
+#pragma once
+
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "client/console.h"
+#include "client/render_flags.h"
+#include "core/base/status.h"
+
+namespace farpoint {
+
+enum class Verb { kRender, kSubmit, kStatus, kCancel, kFetch, kCompare };
+
+struct CommandLine {
+  Verb verb = Verb::kRender;
+  // --help or --version: print this to stdout and be done; nothing else is set.
+  std::optional<std::string> print;
+
+  LogLevel log_level = LogLevel::kInfo;
+  bool quiet = false;
+  std::string json;         // file for statistics or status; "-": stdout; empty: none
+  std::string coordinator;  // HOST:PORT
+  double patience_s = 60;   // how long an unreachable coordinator is waited for
+
+  // render, submit
+  std::string scene;
+  std::vector<GivenFlag> render_flags;
+  uint32_t workers = 1;  // render: embedded workers
+  uint32_t threads = 0;  // render: of each worker; 0: all cores
+  bool farm_ignores = false;  // submit was given --workers or --threads
+  bool detach = false;
+  std::optional<std::string> title;
+  std::optional<int32_t> priority;
+
+  // render, submit, fetch
+  std::string output;  // .exr
+  std::string png;     // empty: no preview
+  float exposure_stops = 0;
+
+  // status, cancel, fetch
+  std::string job;
+
+  // compare
+  std::string image_a, image_b;
+  std::string layer, ref_layer, mask;
+  std::string diff;  // false-colour PNG; empty: none
+  double noise = 0;
+};
+
+// `args` without the program's name. `environment_coordinator` stands in for --coordinator. Every
+// error is a usage error (exit code 2) in one line: what, where, what to do. Reads the file of
+// --config; render flags are recognised here but their values are checked by ApplyRenderFlags.
+absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
+                                             const std::string& environment_coordinator);
+
+}  // namespace farpoint

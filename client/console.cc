@@ -1,0 +1,99 @@
+#include "client/console.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace farpoint {
+
+absl::StatusOr<LogLevel> LogLevelFromName(std::string_view name) {
+  constexpr std::pair<std::string_view, LogLevel> kLevels[] = {{"debug", LogLevel::kDebug},
+                                                               {"info", LogLevel::kInfo},
+                                                               {"warn", LogLevel::kWarn},
+                                                               {"error", LogLevel::kError},
+                                                               {"off", LogLevel::kOff}};
+  for (const auto& [known, level] : kLevels) {
+    if (name == known) return level;
+  }
+  return absl::InvalidArgumentError("expected one of debug, info, warn, error, off");
+}
+
+std::string DurationText(double seconds) {
+  const auto whole = static_cast<long long>(std::llround(std::clamp(seconds, 0.0, 1e9)));
+  char text[48];
+  if (whole >= 3600) {
+    std::snprintf(text, sizeof(text), "%lld:%02lld:%02lld", whole / 3600, whole / 60 % 60,
+                  whole % 60);
+  } else {
+    std::snprintf(text, sizeof(text), "%lld:%02lld", whole / 60, whole % 60);
+  }
+  return text;
+}
+
+std::string ProgressText(const JobStatus& status, int columns) {
+  if (status.state == JobState::kQueued || status.state == JobState::kBaking) {
+    return std::string(NameOf(status.state));
+  }
+  const double fraction = std::clamp(status.progress, 0.0, 1.0);
+  char percent[16];
+  std::snprintf(percent, sizeof(percent), "%3d %%", static_cast<int>(fraction * 100));
+  std::string tail = percent;
+  tail.append("  ").append(std::to_string(status.tiles.committed));
+  tail.append("/").append(std::to_string(status.tiles.total)).append(" tiles");
+  if (status.reissued > 0) tail += "  " + std::to_string(status.reissued) + " again";
+  if (status.eta_s && !IsFinal(status.state)) tail += "  eta " + DurationText(*status.eta_s);
+  const int width = std::min(40, columns - static_cast<int>(tail.size()) - 5);
+  if (width < 5) return tail;
+  const int full = static_cast<int>(fraction * width);
+  std::string bar = "[";
+  bar.append(full, '#').append(width - full, '-').append("] ").append(tail);
+  return bar;
+}
+
+Console::Console(std::FILE* stream, bool terminal, LogLevel level, bool quiet)
+    : stream_(stream), terminal_(terminal), level_(level), quiet_(quiet) {}
+
+Console::~Console() { EraseBar(); }
+
+void Console::EraseBar() {
+  if (bar_drawn_) std::fputs("\r\x1b[K", stream_);
+  bar_drawn_ = false;
+}
+
+void Console::Write(LogLevel level, std::string_view prefix, std::string_view text) {
+  if (level < level_ || (quiet_ && level < LogLevel::kWarn)) return;
+  std::lock_guard lock(mutex_);
+  EraseBar();
+  // In one call, so that lines of several processes stay whole.
+  const std::string line = "farpoint: " + std::string(prefix) + std::string(text) + "\n";
+  std::fwrite(line.data(), 1, line.size(), stream_);
+  std::fflush(stream_);
+}
+
+void Console::Progress(const JobStatus& status) {
+  if (quiet_ || level_ > LogLevel::kInfo) return;
+  std::lock_guard lock(mutex_);
+  if (terminal_) {
+    std::string line = "\r";
+    line.append(ProgressText(status, 79)).append("\x1b[K");
+    std::fwrite(line.data(), 1, line.size(), stream_);
+    bar_drawn_ = true;
+  } else {
+    // A line when the state changes or another tenth is done.
+    std::string report(NameOf(status.state));
+    if (status.state == JobState::kRendering) {
+      report += " " + std::to_string(static_cast<int>(status.progress * 10));
+    }
+    if (report == last_report_) return;
+    last_report_ = report;
+    std::string line = "farpoint: " + std::string(NameOf(status.state));
+    if (status.tiles.total > 0) {
+      line += ", " + std::to_string(status.tiles.committed) + " of " +
+              std::to_string(status.tiles.total) + " tiles";
+    }
+    line += "\n";
+    std::fwrite(line.data(), 1, line.size(), stream_);
+  }
+  std::fflush(stream_);
+}
+
+}  // namespace farpoint

@@ -1,0 +1,22 @@
+// The embedded mode: a coordinator and workers within this process, joined by calls instead of
+// sockets. The one place where the client knows server and worker.
+#pragma once
+
+#include <memory>
+
+#include "client/console.h"
+#include "client/farm_link.h"
+#include "core/base/status.h"
+
+namespace farpoint {
+
+struct EmbeddedFarmOptions {
+  uint32_t workers = 1;
+  uint32_t threads = 0;  // of each worker and of the bake; 0: all cores
+};
+
+// Runs until it is destroyed; tiles in work are then dropped. `console` must outlive it.
+absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOptions& options,
+                                                            Console& console);
+
+}  // namespace farpoint

@@ -1,0 +1,264 @@
+#include "client/grpc_farm_link.h"
+
+#include <grpcpp/grpcpp.h>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <thread>
+#include <utility>
+
+#include "proto/convert.h"
+#include "proto/farpoint.grpc.pb.h"
+#include "proto/grpc_status.h"
+
+namespace farpoint {
+namespace {
+
+using std::chrono::milliseconds;
+using std::chrono::seconds;
+
+constexpr seconds kControlDeadline(20);
+constexpr seconds kInfoDeadline(60);
+// A watch is renewed after so long; it then goes on where it was.
+constexpr seconds kWatchDeadline(600);
+// Bulk calls get time for their bytes at the slowest link that is worth using.
+constexpr seconds kBulkDeadline(60);
+constexpr size_t kSlowestBytesPerSecond = size_t{256} << 10;
+constexpr uint64_t kMaxTileBytes = uint64_t{1} << 32;
+constexpr int kMaxMessageBytes = 64 << 20;  // tile lists of large frames
+
+grpc::ChannelArguments ChannelArguments() {
+  grpc::ChannelArguments arguments;
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 2000);
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 1000);
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
+  arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
+  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
+  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 100);
+  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
+  arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
+  return arguments;
+}
+
+void SetDeadline(grpc::ClientContext& context, seconds time) {
+  context.set_deadline(std::chrono::system_clock::now() + time);
+}
+
+absl::Status Damaged(std::string text) {
+  return absl::UnavailableError("the coordinator's answer is damaged: " + std::move(text));
+}
+
+// Cancels a call when the flag is raised. The context must outlive this.
+class CancelOnStop {
+ public:
+  CancelOnStop(grpc::ClientContext& context, const StopFlag& stop)
+      : thread_([this, &context, &stop] {
+          while (!ended_.load()) {
+            if (stop.raised()) {
+              context.TryCancel();
+              return;
+            }
+            std::this_thread::sleep_for(milliseconds(20));
+          }
+        }) {}
+  ~CancelOnStop() {
+    ended_ = true;
+    thread_.join();
+  }
+
+ private:
+  std::atomic<bool> ended_{false};
+  std::thread thread_;
+};
+
+class GrpcFarmLink final : public FarmLink {
+ public:
+  explicit GrpcFarmLink(const std::string& address)
+      : channel_(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(),
+                                           ChannelArguments())),
+        jobs_(v1::JobService::NewStub(channel_)),
+        blobs_(v1::BlobService::NewStub(channel_)) {}
+
+  absl::StatusOr<std::vector<Digest>> FindMissing(std::span<const Digest> blobs) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kControlDeadline);
+    v1::FindMissingRequest request;
+    for (const Digest& digest : blobs) request.add_sha256(ToWire(digest));
+    v1::FindMissingResponse response;
+    FP_RETURN_IF_ERROR(FromGrpc(blobs_->FindMissing(&context, request, &response)));
+    std::vector<Digest> missing;
+    for (const std::string& hex : response.sha256()) {
+      FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(hex, "sha256"));
+      missing.push_back(digest);
+    }
+    return missing;
+  }
+
+  absl::Status Put(const Digest& digest, const Blob& blob) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kBulkDeadline + seconds(blob.size() / kSlowestBytesPerSecond));
+    v1::PutBlobResponse response;
+    const auto writer = blobs_->Put(&context, &response);
+    v1::PutBlobChunk chunk;
+    chunk.set_sha256(ToWire(digest));
+    chunk.set_size_bytes(blob.size());
+    // At least one message, also for an empty blob.
+    size_t at = 0;
+    do {
+      const size_t count = std::min(kChunkBytes, blob.size() - at);
+      chunk.set_data(blob.bytes().data() + at, count);
+      if (!writer->Write(chunk)) break;  // Finish() says why
+      at += count;
+      chunk.clear_sha256();
+      chunk.clear_size_bytes();
+    } while (at < blob.size());
+    writer->WritesDone();
+    return FromGrpc(writer->Finish());
+  }
+
+  absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kControlDeadline);
+    v1::SubmitRequest request;
+    request.set_protocol_version(kProtocolVersion);
+    *request.mutable_job() = ToWire(spec);
+    request.set_submission_id(submission_id);
+    v1::SubmitResponse response;
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Submit(&context, request, &response)));
+    return JobId{response.job_id()};
+  }
+
+  absl::StatusOr<FarmStatus> Status(const JobId& job) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kControlDeadline);
+    v1::StatusRequest request;
+    request.set_job_id(job.value);
+    v1::StatusResponse response;
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Status(&context, request, &response)));
+    FarmStatus status;
+    for (const v1::JobStatus& wire : response.jobs()) {
+      FP_ASSIGN_OR_RETURN(JobStatus one, JobStatusFromWire(wire));
+      status.jobs.push_back(std::move(one));
+    }
+    for (const v1::WorkerStatus& wire : response.workers()) {
+      FP_ASSIGN_OR_RETURN(WorkerStatus one, WorkerStatusFromWire(wire));
+      status.workers.push_back(std::move(one));
+    }
+    return status;
+  }
+
+  absl::Status Cancel(const JobId& job) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kControlDeadline);
+    v1::CancelRequest request;
+    request.set_job_id(job.value);
+    v1::CancelResponse response;
+    return FromGrpc(jobs_->Cancel(&context, request, &response));
+  }
+
+  absl::Status Watch(const JobId& job, uint64_t after_sequence, const StopFlag& stop,
+                     const std::function<void(const JobEvent&)>& on_event) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kWatchDeadline);
+    v1::WatchRequest request;
+    request.set_job_id(job.value);
+    request.set_after_sequence(after_sequence);
+    const auto reader = jobs_->Watch(&context, request);
+    const CancelOnStop cancel(context, stop);
+    v1::JobEvent wire;
+    while (reader->Read(&wire)) {
+      const absl::StatusOr<JobEvent> event = JobEventFromWire(wire);
+      if (!event.ok()) {
+        context.TryCancel();
+        while (reader->Read(&wire)) {
+        }
+        reader->Finish().ok();
+        return Annotate(event.status(), "the coordinator's event cannot be read");
+      }
+      on_event(*event);
+    }
+    return FromGrpc(reader->Finish());
+  }
+
+  absl::StatusOr<JobInfo> Info(const JobId& job) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kInfoDeadline);
+    v1::FetchInfoRequest request;
+    request.set_job_id(job.value);
+    v1::FetchInfoResponse response;
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->FetchInfo(&context, request, &response)));
+    return JobInfoFromWire(response);
+  }
+
+  absl::Status FetchTiles(const JobId& job, std::span<const uint32_t> tiles,
+                          const std::function<absl::Status(TileData)>& on_tile) override {
+    grpc::ClientContext context;
+    SetDeadline(context, kBulkDeadline * std::max<size_t>(1, tiles.size()));
+    v1::FetchTilesRequest request;
+    request.set_job_id(job.value);
+    for (const uint32_t tile : tiles) request.add_tiles(tile);
+    const auto reader = jobs_->FetchTiles(&context, request);
+    const absl::Status read = ReadTiles(*reader, on_tile);
+    if (!read.ok()) {
+      context.TryCancel();
+      v1::TileChunk rest;
+      while (reader->Read(&rest)) {
+      }
+      reader->Finish().ok();
+      return read;
+    }
+    return FromGrpc(reader->Finish());
+  }
+
+ private:
+  // Memory grows with the bytes that arrive, not with what a header promises.
+  static absl::Status ReadTiles(grpc::ClientReader<v1::TileChunk>& reader,
+                                const std::function<absl::Status(TileData)>& on_tile) {
+    v1::TileChunk chunk;
+    TileData tile;
+    std::vector<std::byte> bytes;
+    uint64_t size = 0;
+    bool open = false;
+    while (reader.Read(&chunk)) {
+      if (!open) {
+        if (chunk.offset_bytes() != 0) return Damaged("a tile does not start at its beginning");
+        if (chunk.size_bytes() > kMaxTileBytes) {
+          return Damaged("a tile of " + std::to_string(chunk.size_bytes()) + " bytes");
+        }
+        size = chunk.size_bytes();
+        tile.tile = chunk.tile();
+        FP_ASSIGN_OR_RETURN(tile.sha256, DigestFromWire(chunk.sha256(), "sha256"));
+        bytes.clear();
+        open = true;
+      }
+      const std::string& data = chunk.data();
+      if (chunk.tile() != tile.tile || chunk.offset_bytes() != bytes.size() ||
+          data.size() > size - bytes.size() || (data.empty() && size > bytes.size())) {
+        return Damaged("a piece of tile " + std::to_string(tile.tile) + " is out of place");
+      }
+      const auto* begin = reinterpret_cast<const std::byte*>(data.data());
+      bytes.insert(bytes.end(), begin, begin + data.size());
+      if (bytes.size() == size) {
+        tile.bytes = Blob::FromVector(std::move(bytes));
+        bytes = {};
+        FP_RETURN_IF_ERROR(on_tile(std::move(tile)));
+        tile = {};
+        open = false;
+      }
+    }
+    return absl::OkStatus();
+  }
+
+  std::shared_ptr<grpc::Channel> channel_;
+  std::unique_ptr<v1::JobService::Stub> jobs_;
+  std::unique_ptr<v1::BlobService::Stub> blobs_;
+};
+
+}  // namespace
+
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address) {
+  return std::make_unique<GrpcFarmLink>(address);
+}
+
+}  // namespace farpoint

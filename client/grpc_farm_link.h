@@ -1,0 +1,15 @@
+// A coordinator over gRPC. Every call has a deadline; keepalive pings find a cut link within
+// seconds. Connecting happens at the first call.
+#pragma once
+
+#include <memory>
+#include <string>
+
+#include "client/farm_link.h"
+
+namespace farpoint {
+
+// `address` is HOST:PORT.
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address);
+
+}  // namespace farpoint

@@ -1,0 +1,95 @@
+#include "client/job_request.h"
+
+#include <filesystem>
+#include <utility>
+
+#include "core/base/blob.h"
+#include "proto/convert.h"
+
+namespace farpoint {
+namespace {
+
+constexpr size_t kMaxJobFileBytes = size_t{16} << 20;
+
+struct JobFile {
+  std::string asset_path;
+  JobSpec spec;
+};
+
+absl::StatusOr<JobFile> ReadJobFile(const std::string& path) {
+  FP_ASSIGN_OR_RETURN(const Blob blob, ReadFile(path, kMaxJobFileBytes));
+  const std::string_view text(reinterpret_cast<const char*>(blob.bytes().data()), blob.size());
+  FP_ASSIGN_OR_RETURN(const v1::RenderJob wire, RenderJobFromJson(text, path));
+  if (wire.asset().root().empty()) {
+    return absl::InvalidArgumentError(path + ": asset.root: not given; name the scene's file, "
+                                             "relative to the job file");
+  }
+  if (wire.asset().files_size() > 0) {
+    return absl::InvalidArgumentError(path + ": asset.files: is found by farpoint itself; leave "
+                                             "it out of the job file");
+  }
+  const std::filesystem::path root(wire.asset().root());
+  JobFile file;
+  file.asset_path =
+      root.is_absolute() ? root.string()
+                         : (std::filesystem::path(path).parent_path() / root).string();
+  if (IsJobFile(file.asset_path)) {
+    return absl::InvalidArgumentError(path + ": asset.root: " + wire.asset().root() +
+                                      " is a job file; name a .gltf or .glb");
+  }
+  FP_RETURN_IF_ERROR(Annotate(CheckScenePath(file.asset_path), path + ": asset.root"));
+  auto spec = JobFromWire(wire);
+  FP_RETURN_IF_ERROR(Annotate(spec.status(), path));
+  file.spec = *std::move(spec);
+  return file;
+}
+
+v1::RenderJob ImageJob(JobSpec spec) {
+  const RenderSettings defaults;
+  spec.settings.tile_px = defaults.tile_px;
+  spec.settings.no_skip = defaults.no_skip;
+  spec.title.clear();
+  spec.priority = 0;
+  v1::RenderJob wire = ToWire(spec);
+  wire.clear_limits();
+  wire.mutable_settings()->clear_tile_px();
+  wire.mutable_settings()->clear_no_skip();
+  return wire;
+}
+
+}  // namespace
+
+absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
+                                               std::span<const GivenFlag> flags,
+                                               bool& usage_error) {
+  usage_error = true;
+  FP_RETURN_IF_ERROR(CheckScenePath(scene));
+  usage_error = false;
+  JobFile file{.asset_path = scene};
+  if (IsJobFile(scene)) {
+    FP_ASSIGN_OR_RETURN(file, ReadJobFile(scene));
+  }
+  usage_error = true;
+  FP_RETURN_IF_ERROR(ApplyRenderFlags(flags, file.spec));
+  usage_error = false;
+
+  PreparedRequest request{.spec = std::move(file.spec)};
+  FP_ASSIGN_OR_RETURN(request.asset, CollectAsset(file.asset_path));
+  request.spec.asset_root = request.asset.root;
+  request.spec.asset_files.clear();
+  for (const auto& [uri, blob] : request.asset.files) {
+    request.spec.asset_files[uri] = blob.Hash();
+  }
+  FP_RETURN_IF_ERROR(Annotate(ValidateJob(request.spec), scene));
+  return request;
+}
+
+std::string ImageSettingsJson(const JobSpec& spec) { return RenderJobToJson(ImageJob(spec)); }
+
+Digest JobHash(const JobSpec& spec) {
+  // No map fields, so the encoding of equal messages is equal.
+  const std::string bytes = ImageJob(spec).SerializeAsString();
+  return Sha256().Update(bytes).Finish();
+}
+
+}  // namespace farpoint

@@ -1,0 +1,150 @@
+#include "client/job_run.h"
+
+#include <algorithm>
+#include <cstdio>
+#include <map>
+#include <random>
+#include <utility>
+#include <vector>
+
+#include "client/stitcher.h"
+
+namespace farpoint {
+namespace {
+
+constexpr size_t kDigestsPerQuestion = 4096;
+// Bounds what one call may take and what is lost if it breaks.
+constexpr size_t kTilesPerCall = 32;
+constexpr int kFetchRounds = 4;
+
+std::string RandomId() {
+  std::random_device entropy;
+  std::string id;
+  for (int i = 0; i < 4; ++i) {
+    char digits[9];
+    std::snprintf(digits, sizeof(digits), "%08x", static_cast<unsigned>(entropy()));
+    id += digits;
+  }
+  return id;
+}
+
+std::string SizeText(size_t bytes) {
+  char text[32];
+  std::snprintf(text, sizeof(text), "%.1f MiB", static_cast<double>(bytes) / (1 << 20));
+  return text;
+}
+
+}  // namespace
+
+absl::Status OutcomeOf(const JobStatus& status) {
+  switch (status.state) {
+    case JobState::kDone:
+      return absl::OkStatus();
+    case JobState::kFailed: {
+      const std::string context = "job " + status.id.value + " failed";
+      if (status.error.ok()) return absl::InternalError(context + " without saying why");
+      return Annotate(status.error, context);
+    }
+    case JobState::kCancelled:
+      return absl::CancelledError("job " + status.id.value +
+                                  " was cancelled; submit it again to render it");
+    default:
+      return absl::FailedPreconditionError(
+          "job " + status.id.value + " is not done, it is " + std::string(NameOf(status.state)) +
+          "; wait for it, farpoint status shows how far it is");
+  }
+}
+
+absl::StatusOr<JobId> JobRun::Submit(const PreparedRequest& request) {
+  std::map<Digest, const Blob*> blobs;
+  for (const auto& [uri, digest] : request.spec.asset_files) {
+    blobs[digest] = &request.asset.files.at(uri);
+  }
+  std::vector<Digest> all;
+  for (const auto& [digest, blob] : blobs) all.push_back(digest);
+
+  size_t sent = 0, sent_bytes = 0;
+  for (size_t first = 0; first < all.size(); first += kDigestsPerQuestion) {
+    const size_t count = std::min(kDigestsPerQuestion, all.size() - first);
+    const std::span<const Digest> question(all.data() + first, count);
+    FP_ASSIGN_OR_RETURN(const std::vector<Digest> missing,
+                        retry_.Get<std::vector<Digest>>([&] { return link_.FindMissing(question); }));
+    for (const Digest& digest : missing) {
+      const auto blob = blobs.find(digest);
+      if (blob == blobs.end()) {
+        return absl::InternalError("the coordinator asks for a blob that it was not told of: " +
+                                   digest.Hex());
+      }
+      FP_RETURN_IF_ERROR(retry_.Run([&] { return link_.Put(digest, *blob->second); }));
+      ++sent;
+      sent_bytes += blob->second->size();
+    }
+  }
+  if (sent > 0) {
+    console_.Debug("sent " + std::to_string(sent) + " of " + std::to_string(all.size()) +
+                   " files, " + SizeText(sent_bytes));
+  }
+  const std::string submission_id = RandomId();
+  return retry_.Get<JobId>([&] { return link_.Submit(request.spec, submission_id); });
+}
+
+absl::Status JobRun::Wait(const JobId& job) {
+  uint64_t last_sequence = 0;
+  JobStatus last;
+  FP_RETURN_IF_ERROR(retry_.Run([&] {
+    return link_.Watch(job, last_sequence, stop_, [&](const JobEvent& event) {
+      retry_.Succeeded();
+      if (event.sequence > 0) last_sequence = event.sequence;
+      last = event.status;
+      if (const auto* note = std::get_if<std::string>(&event.body)) console_.Info(*note);
+      console_.Progress(event.status);
+    });
+  }));
+  if (!IsFinal(last.state)) {
+    // The events ended before the one that says so: ask.
+    FP_ASSIGN_OR_RETURN(const FarmStatus status,
+                        retry_.Get<FarmStatus>([&] { return link_.Status(job); }));
+    if (status.jobs.size() != 1) {
+      return absl::InternalError("the coordinator says nothing about job " + job.value);
+    }
+    last = status.jobs[0];
+  }
+  return OutcomeOf(last);
+}
+
+absl::StatusOr<FinishedJob> JobRun::Fetch(const JobId& job) {
+  FP_ASSIGN_OR_RETURN(JobInfo info, retry_.Get<JobInfo>([&] { return link_.Info(job); }));
+  FP_RETURN_IF_ERROR(OutcomeOf(info.status));
+  FP_ASSIGN_OR_RETURN(Stitcher stitcher, Stitcher::Create(info));
+  for (int round = 0; round < kFetchRounds; ++round) {
+    const std::vector<uint32_t> missing = stitcher.Missing();
+    if (missing.empty()) break;
+    for (size_t first = 0; first < missing.size(); first += kTilesPerCall) {
+      std::vector<uint32_t> wanted(
+          missing.begin() + first,
+          missing.begin() + std::min(first + kTilesPerCall, missing.size()));
+      FP_RETURN_IF_ERROR(retry_.Run([&]() -> absl::Status {
+        if (wanted.empty()) return absl::OkStatus();
+        return link_.FetchTiles(job, wanted, [&](TileData tile) -> absl::Status {
+          if (stop_.raised()) return absl::CancelledError("stopped by a signal");
+          const absl::Status added = stitcher.Add(tile);
+          if (!added.ok()) {
+            console_.Warn(std::string(added.message()) + "; it is fetched again");
+            return absl::OkStatus();
+          }
+          retry_.Succeeded();
+          std::erase(wanted, tile.tile);  // not asked for again if this call breaks
+          return absl::OkStatus();
+        });
+      }));
+    }
+  }
+  const std::vector<uint32_t> missing = stitcher.Missing();
+  if (missing.empty()) return FinishedJob{std::move(info), std::move(stitcher).TakeFilm()};
+  return absl::UnavailableError("tile " + std::to_string(missing[0]) + " and " +
+                                std::to_string(missing.size() - 1) + " more of job " + job.value +
+                                " arrived damaged " + std::to_string(kFetchRounds) +
+                                " times; check the network and the coordinator's disk");
+}
+
+}  // namespace farpoint

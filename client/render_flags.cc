@@ -1,0 +1,437 @@
+#include "client/render_flags.h"
+
+#include <algorithm>
+#include <array>
+#include <charconv>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "client/nearest_name.h"
+#include "core/image/layers.h"
+
+namespace farpoint {
+namespace {
+
+using std::string_view_literals::operator""sv;
+
+absl::Status Bad(std::string text) { return absl::InvalidArgumentError(text); }
+
+std::vector<std::string_view> Split(std::string_view text, char separator) {
+  std::vector<std::string_view> parts;
+  while (true) {
+    const size_t at = text.find(separator);
+    parts.push_back(text.substr(0, at));
+    if (at == std::string_view::npos) return parts;
+    text.remove_prefix(at + 1);
+  }
+}
+
+template <typename T>
+bool ParseWhole(std::string_view text, T& value) {
+  const char* end = text.data() + text.size();
+  const auto result = std::from_chars(text.data(), end, value);
+  return result.ec == std::errc() && result.ptr == end && !text.empty();
+}
+
+bool ParseFinite(std::string_view text, double& value) {
+  return ParseWhole(text, value) && std::isfinite(value);
+}
+
+template <typename T>
+absl::Status ParseCount(std::string_view text, T& value) {
+  T parsed = 0;
+  if (!ParseWhole(text, parsed)) {
+    return Bad("expected a whole number from 0 to " +
+               std::to_string(std::numeric_limits<T>::max()));
+  }
+  value = parsed;
+  return absl::OkStatus();
+}
+
+absl::Status ParseVec3(std::string_view text, Vec3d& v) {
+  const auto parts = Split(text, ',');
+  Vec3d parsed;
+  if (parts.size() != 3 || !ParseFinite(parts[0], parsed.x) || !ParseFinite(parts[1], parsed.y) ||
+      !ParseFinite(parts[2], parsed.z)) {
+    return Bad("expected three finite numbers with commas, e.g. 0,1.5,-2");
+  }
+  v = parsed;
+  return absl::OkStatus();
+}
+
+absl::Status ParseColor(std::string_view text, double max, Rgb& color) {
+  Vec3d v;
+  FP_RETURN_IF_ERROR(ParseVec3(text, v));
+  if (std::min({v.x, v.y, v.z}) < 0 || std::max({v.x, v.y, v.z}) > max) {
+    return Bad(max == 1 ? "each component must lie in [0, 1]"
+                        : "each component must lie in [0, 1e30]");
+  }
+  color = Rgb(v);
+  return absl::OkStatus();
+}
+
+constexpr double kMaxRadiance = 1e30;  // as in ValidateJob
+
+template <typename T>
+struct Choice {
+  std::string_view name;
+  T value;
+};
+
+template <typename T, size_t N>
+absl::Status ParseChoice(std::string_view text, const Choice<T> (&choices)[N], T& value) {
+  std::vector<std::string> names;
+  std::string listed;
+  for (const auto& choice : choices) {
+    if (text == choice.name) {
+      value = choice.value;
+      return absl::OkStatus();
+    }
+    names.emplace_back(choice.name);
+    listed += (listed.empty() ? "" : ", ") + names.back();
+  }
+  const std::string nearest = NearestName(text, names);
+  return Bad("expected one of " + listed +
+             (nearest.empty() ? "" : "; did you mean '" + nearest + "'?"));
+}
+
+absl::Status ApplyIntegrator(std::string_view value, JobEdit& edit) {
+  if (value == "irrcache") {
+    return Bad("the irradiance cache is not built yet; use fpbgi, pbgi, dpbgi or pt");
+  }
+  return ParseChoice(value,
+                     {Choice<Integrator>{"fpbgi", Integrator::kFpbgi},
+                      {"pbgi", Integrator::kPbgi},
+                      {"dpbgi", Integrator::kDpbgi},
+                      {"pt", Integrator::kPt}},
+                     edit.spec.settings.integrator);
+}
+
+absl::Status ApplyResolution(std::string_view value, JobEdit& edit) {
+  const auto parts = Split(value, 'x');
+  int width = 0, height = 0;
+  if (parts.size() != 2 || !ParseWhole(parts[0], width) || !ParseWhole(parts[1], height)) {
+    return Bad("expected WIDTHxHEIGHT in pixels, e.g. 1280x720");
+  }
+  const FilmSpec film{width, height, {0, 0, width, height}};
+  FP_RETURN_IF_ERROR(ValidateFilm(film));
+  edit.spec.film = film;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyCrop(std::string_view value, JobEdit& edit) {
+  const auto parts = Split(value, ',');
+  PixelRect crop;
+  if (parts.size() != 4 || !ParseWhole(parts[0], crop.x0) || !ParseWhole(parts[1], crop.y0) ||
+      !ParseWhole(parts[2], crop.x1) || !ParseWhole(parts[3], crop.y1)) {
+    return Bad("expected x0,y0,x1,y1 in pixels of the whole frame, x1 and y1 excluded");
+  }
+  FilmSpec film = edit.spec.film;
+  film.crop = crop;
+  FP_RETURN_IF_ERROR(ValidateFilm(film));
+  edit.spec.film = film;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyClusters(std::string_view value, JobEdit& edit) {
+  if (value == "adaptive") {
+    return Bad("adaptive clusters are not built yet; give the number of clusters per block");
+  }
+  uint32_t clusters = 0;
+  FP_RETURN_IF_ERROR(ParseCount(value, clusters));
+  if (clusters == 0) return Bad("expected the number of clusters per block, 1..1024");
+  edit.spec.settings.clusters = clusters;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyBounces(std::string_view value, JobEdit& edit) {
+  uint32_t bounces = 0;
+  FP_RETURN_IF_ERROR(ParseCount(value, bounces));
+  if (bounces != 1) {
+    return Bad("only one bounce of indirect light is built; leave the flag out or give 1");
+  }
+  return absl::OkStatus();
+}
+
+absl::Status ApplyLayers(std::string_view value, JobEdit& edit) {
+  std::vector<Layer> layers = DefaultLayers();
+  for (std::string_view name : Split(value, ',')) {
+    if (name == "none") {
+      layers = {Layer::kBeauty};
+      continue;
+    }
+    FP_ASSIGN_OR_RETURN(const Layer layer, LayerFromName(name));
+    if (std::find(layers.begin(), layers.end(), layer) == layers.end()) layers.push_back(layer);
+  }
+  std::sort(layers.begin(), layers.end());  // the fixed order: equal sets are equal jobs
+  edit.spec.settings.layers = std::move(layers);
+  return absl::OkStatus();
+}
+
+absl::Status ApplySun(std::string_view value, JobEdit& edit) {
+  const auto parts = Split(value, ':');
+  if (parts.size() != 2) {
+    return Bad("expected x,y,z:r,g,b: the direction to the sun and its irradiance in W/m²");
+  }
+  SunOverride sun;
+  FP_RETURN_IF_ERROR(Annotate(ParseVec3(parts[0], sun.to_sun), "direction"));
+  if (MaxAbs(sun.to_sun) == 0) return Bad("direction: must not be zero");
+  FP_RETURN_IF_ERROR(Annotate(ParseColor(parts[1], kMaxRadiance, sun.irradiance), "irradiance"));
+  if (!edit.suns_replaced) edit.spec.overrides.suns.clear();
+  edit.suns_replaced = true;
+  edit.spec.overrides.suns.push_back(sun);
+  return absl::OkStatus();
+}
+
+absl::Status ParseDirection(std::string_view value, std::optional<Vec3d>& direction) {
+  Vec3d v;
+  FP_RETURN_IF_ERROR(ParseVec3(value, v));
+  if (MaxAbs(v) == 0) return Bad("must not be zero");
+  direction = v;
+  return absl::OkStatus();
+}
+
+absl::Status ParsePoint(std::string_view value, std::optional<Vec3d>& point) {
+  Vec3d v;
+  FP_RETURN_IF_ERROR(ParseVec3(value, v));
+  point = v;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyFov(std::string_view value, JobEdit& edit) {
+  double fov_deg = 0;
+  if (!ParseFinite(value, fov_deg) || fov_deg <= 0 || fov_deg >= 180) {
+    return Bad("expected the vertical angle in degrees, more than 0 and less than 180");
+  }
+  edit.yfov_deg = fov_deg;
+  return absl::OkStatus();
+}
+
+// Makes one camera of what the flags say and what the job had.
+absl::Status ResolveCameraFlags(JobEdit& edit) {
+  const bool free = edit.eye || edit.target || edit.up || edit.yfov_deg;
+  if (edit.camera_name) {
+    if (free) {
+      return Bad("--camera " + *edit.camera_name +
+                 ": names a camera of the scene; leave --eye, --target, --up and --fov out");
+    }
+    edit.spec.camera = CameraName{*edit.camera_name};
+    return absl::OkStatus();
+  }
+  if (!free) return absl::OkStatus();
+  const LookAt* before = std::get_if<LookAt>(&edit.spec.camera);
+  if (before == nullptr) {
+    if (!edit.eye && !edit.target) {
+      return Bad(std::string(edit.up ? "--up" : "--fov") +
+                 ": belongs to a free camera; give --eye and --target too");
+    }
+    if (!edit.target) return Bad("--eye: needs --target; say what the camera looks at");
+    if (!edit.eye) return Bad("--target: needs --eye; say where the camera stands");
+  }
+  LookAt look_at = before == nullptr ? LookAt{} : *before;
+  look_at.eye = edit.eye.value_or(look_at.eye);
+  look_at.target = edit.target.value_or(look_at.target);
+  look_at.up = edit.up.value_or(look_at.up);
+  look_at.yfov_deg = edit.yfov_deg.value_or(look_at.yfov_deg);
+  const Vec3d forward = look_at.target - look_at.eye;
+  if (MaxAbs(forward) == 0) return Bad("--eye, --target: are the same point; move one");
+  if (MaxAbs(Cross(forward / MaxAbs(forward), look_at.up / MaxAbs(look_at.up))) < 1e-9) {
+    return Bad("--up: is parallel to the line from --eye to --target; give another --up");
+  }
+  edit.spec.camera = look_at;
+  return absl::OkStatus();
+}
+
+constexpr auto kImage = "Image"sv, kCamera = "Camera"sv, kLights = "Lights and materials"sv,
+               kMethod = "Method"sv, kSpeed = "Speed only (no pixel changes)"sv;
+
+constexpr RenderFlag kRenderFlags[] = {
+    {"--preset", "NAME", kMethod,
+     "paper: every parameter as in the paper (32x32 blocks, 100 clusters, epsilon 0.1, opaque "
+     "splats, 5 iterations, 24x24 buffers); other flags override it",
+     [](std::string_view value, JobEdit& edit) {
+       bool paper = false;
+       FP_RETURN_IF_ERROR(ParseChoice(value, {Choice<bool>{"paper", true}}, paper));
+       ApplyPaperPreset(edit.spec.settings);
+       return absl::OkStatus();
+     }},
+    {"--integrator", "NAME", kMethod,
+     "fpbgi (factorized point-based GI, the default), pbgi (every receiver alone), dpbgi (pbgi "
+     "with a smaller buffer) or pt (path tracing, the ground truth)",
+     ApplyIntegrator},
+    {"--resolution", "WxH", kImage, "size of the whole frame in pixels; default 1280x720",
+     ApplyResolution},
+    {"--crop", "x0,y0,x1,y1", kImage,
+     "render only these pixels of the frame, x1 and y1 excluded; they equal those of the whole "
+     "frame",
+     ApplyCrop},
+    {"--spp", "N", kImage, "receivers per pixel, 1..256; default 1: the pixel's centre",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.spp);
+     }},
+    {"--aov", "LIST", kImage,
+     "more layers besides the default ones, with commas: irradiance, direct_irradiance, …; 'none' "
+     "in front leaves the default ones out",
+     ApplyLayers},
+    {"--seed", "N", kImage, "seed of every random choice; default 0",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.seed);
+     }},
+    {"--paths", "N", kMethod, "pt: paths per receiver, 1..1048576; default 64",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.paths);
+     }},
+    {"--light-samples", "N", kMethod,
+     "shadow rays per receiver or surfel and light, 1..4096; default 16",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.light_samples);
+     }},
+    {"--points", "N", kMethod, "surfels; default 0: from the scene's area and size",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.points);
+     }},
+    {"--microbuffer", "N", kMethod, "side of the microbuffer in pixels, 1..256; default 0: the map's",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.microbuffer);
+     }},
+    {"--buffer-map", "NAME", kMethod,
+     "octahedral (whole sphere, the default) or cosine (hemisphere about the normal; pbgi, dpbgi)",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseChoice(value,
+                          {Choice<BufferMap>{"cosine", BufferMap::kCosine},
+                           {"octahedral", BufferMap::kOctahedral}},
+                          edit.spec.settings.buffer_map);
+     }},
+    {"--splat", "NAME", kMethod,
+     "coverage (a node covers as much of a pixel as its solid angle, the default) or opaque (the "
+     "nearest wins)",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseChoice(
+           value, {Choice<Splat>{"coverage", Splat::kCoverage}, {"opaque", Splat::kOpaque}},
+           edit.spec.settings.splat);
+     }},
+    {"--clusters", "N", kMethod, "fpbgi: clusters per block, 1..1024", ApplyClusters},
+    {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.1",
+     [](std::string_view value, JobEdit& edit) {
+       double epsilon = 0;
+       if (!ParseFinite(value, epsilon) || epsilon < 0 || epsilon > std::numeric_limits<float>::max()) {
+         return Bad("expected a finite number of at least 0");
+       }
+       edit.spec.settings.epsilon = static_cast<float>(epsilon);
+       return absl::OkStatus();
+     }},
+    {"--bounces", "N", kMethod, "bounces of indirect light; 1 is built", ApplyBounces},
+    {"--camera", "NAME", kCamera, "a camera of the scene; default: the first",
+     [](std::string_view value, JobEdit& edit) {
+       if (value.empty()) return Bad("expected the name of a camera of the scene");
+       edit.camera_name = std::string(value);
+       return absl::OkStatus();
+     }},
+    {"--eye", "x,y,z", kCamera, "a free camera's position in metres; needs --target",
+     [](std::string_view value, JobEdit& edit) { return ParsePoint(value, edit.eye); }},
+    {"--target", "x,y,z", kCamera, "what the free camera looks at; needs --eye",
+     [](std::string_view value, JobEdit& edit) { return ParsePoint(value, edit.target); }},
+    {"--up", "x,y,z", kCamera, "the free camera's upward direction; default 0,1,0",
+     [](std::string_view value, JobEdit& edit) { return ParseDirection(value, edit.up); }},
+    {"--fov", "DEG", kCamera, "the free camera's vertical field of view in degrees; default 45",
+     ApplyFov},
+    {"--sun", "x,y,z:r,g,b", kLights,
+     "a sun in place of the scene's punctual lights: the direction from the scene to it, its "
+     "irradiance on a facing surface in W/m²; may be repeated",
+     ApplySun, /*repeatable=*/true},
+    {"--sky", "r,g,b", kLights, "a constant sky of this radiance in W/(m² sr); replaces the scene's",
+     [](std::string_view value, JobEdit& edit) {
+       Rgb sky;
+       FP_RETURN_IF_ERROR(ParseColor(value, kMaxRadiance, sky));
+       edit.spec.overrides.sky = sky;
+       return absl::OkStatus();
+     }},
+    {"--albedo", "r,g,b", kLights, "replaces every material's base colour and its texture, each in [0, 1]",
+     [](std::string_view value, JobEdit& edit) {
+       Rgb albedo;
+       FP_RETURN_IF_ERROR(ParseColor(value, 1, albedo));
+       edit.spec.overrides.albedo = albedo;
+       return absl::OkStatus();
+     }},
+    {"--light-units", "UNITS", kLights,
+     "photometric (glTF's lux and candela are divided by 683 lm/W, the default) or raw (taken as "
+     "W/m² and W/sr)",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseChoice(value,
+                          {Choice<LightUnits>{"photometric", LightUnits::kPhotometric},
+                           {"raw", LightUnits::kRaw}},
+                          edit.spec.light_units);
+     }},
+    {"--tile", "N", kSpeed, "side of a tile in pixels, a multiple of 32; default 128",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.tile_px);
+     }},
+    {"--no-skip", "", kSpeed, "compute also what the scene does not need",
+     [](std::string_view, JobEdit& edit) {
+       edit.spec.settings.no_skip = true;
+       return absl::OkStatus();
+     }},
+};
+
+constexpr RefusedFlag kRefusedFlags[] = {
+    {"--fill", "filling cluster buffers by rays is not built yet; leave the flag out: the tree's "
+               "cut fills them"},
+    {"--quality", "quality levels are not built yet; set --points, --clusters and --microbuffer"},
+    {"--env", "environment maps are not built yet; use --sky r,g,b for a constant sky"},
+};
+
+std::string Lower(std::string_view text) {
+  std::string lower(text);
+  for (char& c : lower) c = c >= 'A' && c <= 'Z' ? static_cast<char>(c - 'A' + 'a') : c;
+  return lower;
+}
+
+}  // namespace
+
+std::span<const RenderFlag> RenderFlags() { return kRenderFlags; }
+std::span<const RefusedFlag> RefusedFlags() { return kRefusedFlags; }
+
+absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec) {
+  for (const auto& [name, value] : given) {
+    for (const RefusedFlag& flag : RefusedFlags()) {
+      if (name == flag.name) return Bad(name + ": " + std::string(flag.reason));
+    }
+  }
+  JobEdit edit{.spec = spec};
+  if (edit.spec.film.width == 0) {
+    edit.spec.film = {kDefaultWidth, kDefaultHeight, {0, 0, kDefaultWidth, kDefaultHeight}};
+  }
+  for (const RenderFlag& flag : RenderFlags()) {
+    for (const auto& [name, value] : given) {
+      if (name != flag.name) continue;
+      const std::string context = value.empty() ? name : name + " " + value;
+      const bool was_valid = ValidateSettings(edit.spec.settings).ok();
+      FP_RETURN_IF_ERROR(Annotate(flag.apply(value, edit), context));
+      // Ranges live in one place; the flag that leaves them is the one to blame.
+      if (was_valid) {
+        FP_RETURN_IF_ERROR(Annotate(ValidateSettings(edit.spec.settings), context));
+      }
+    }
+  }
+  FP_RETURN_IF_ERROR(ResolveCameraFlags(edit));
+  spec = std::move(edit.spec);
+  return absl::OkStatus();
+}
+
+bool IsJobFile(std::string_view path) { return Lower(path).ends_with(".json"); }
+
+absl::Status CheckScenePath(std::string_view path) {
+  const std::string lower = Lower(path);
+  if (lower.ends_with(".gltf") || lower.ends_with(".glb") || lower.ends_with(".json")) {
+    return absl::OkStatus();
+  }
+  if (lower.ends_with(".obj") || lower.ends_with(".ply")) {
+    return Bad(std::string(path) + ": " + lower.substr(lower.size() - 4) +
+               " scenes are not built yet; convert the scene to glTF 2.0 (.gltf or .glb)");
+  }
+  return Bad(std::string(path) +
+             ": not a scene by its name; expected .gltf, .glb or a job file .json");
+}
+
+}  // namespace farpoint

@@ -1,0 +1,100 @@
+#include "client/stitcher.h"
+
+#include <algorithm>
+#include <string>
+#include <utility>
+
+namespace farpoint {
+namespace {
+
+std::string RectText(const PixelRect& r) {
+  return std::to_string(r.x0) + "," + std::to_string(r.y0) + "," + std::to_string(r.x1) + "," +
+         std::to_string(r.y1);
+}
+
+}  // namespace
+
+Stitcher::Stitcher(const JobInfo& info, Film film)
+    : tiles_(info.tiles), have_(info.tiles.size(), false), film_(std::move(film)) {}
+
+absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info) {
+  FP_RETURN_IF_ERROR(Annotate(ValidateFilm(info.spec.film), "job " + info.status.id.value));
+  const PixelRect& crop = info.spec.film.crop;
+  int64_t covered = 0;
+  for (size_t i = 0; i < info.tiles.size(); ++i) {
+    const TileInfo& tile = info.tiles[i];
+    if (tile.rect.empty() || !crop.Contains(tile.rect)) {
+      return absl::InvalidArgumentError("tile " + std::to_string(i) + " has the pixels " +
+                                        RectText(tile.rect) + " outside the crop " +
+                                        RectText(crop) + "; coordinator and client do not match");
+    }
+    if (tile.sha256.empty()) {
+      return absl::FailedPreconditionError("tile " + std::to_string(i) + " of job " +
+                                           info.status.id.value +
+                                           " is not committed yet; wait until the job is done");
+    }
+    covered += tile.rect.area();
+  }
+  // Inside the crop, not overlapping, and as large together: then each pixel is there once. Tiles
+  // lie on a grid, so that two overlap only if they share a corner row and column.
+  std::vector<PixelRect> sorted;
+  for (const TileInfo& tile : info.tiles) sorted.push_back(tile.rect);
+  std::sort(sorted.begin(), sorted.end(), [](const PixelRect& a, const PixelRect& b) {
+    return std::pair(a.y0, a.x0) < std::pair(b.y0, b.x0);
+  });
+  for (size_t i = 1; i < sorted.size(); ++i) {
+    const PixelRect& a = sorted[i - 1];
+    const PixelRect& b = sorted[i];
+    const bool next_in_row = a.y0 == b.y0 && a.y1 == b.y1 && a.x1 <= b.x0;
+    const bool next_row = a.y1 <= b.y0;
+    if (!next_in_row && !next_row) {
+      return absl::InvalidArgumentError("the tiles " + RectText(a) + " and " + RectText(b) +
+                                        " do not lie on one grid; coordinator and client do not "
+                                        "match");
+    }
+  }
+  if (covered != crop.area()) {
+    return absl::InvalidArgumentError("the tiles have " + std::to_string(covered) +
+                                      " pixels, the crop has " + std::to_string(crop.area()) +
+                                      "; coordinator and client do not match");
+  }
+  return Stitcher(info, Film(crop, info.spec.settings.layers));
+}
+
+absl::Status Stitcher::Add(const TileData& tile) {
+  const std::string name = "tile " + std::to_string(tile.tile);
+  if (tile.tile >= tiles_.size()) {
+    return absl::DataLossError(name + " is not one of the job's " +
+                               std::to_string(tiles_.size()) + " tiles");
+  }
+  if (have_[tile.tile]) return absl::OkStatus();
+  const TileInfo& expected = tiles_[tile.tile];
+  const Digest actual = tile.bytes.Hash();
+  if (actual != expected.sha256) {
+    return absl::DataLossError(name + " arrived damaged: its SHA-256 is " + actual.Hex() +
+                               ", announced was " + expected.sha256.Hex());
+  }
+  auto film = DecodeFilm(tile.bytes.bytes());
+  FP_RETURN_IF_ERROR(Annotate(film.status(), name));
+  if (film->rect() != expected.rect) {
+    return absl::DataLossError(name + " has the pixels " + RectText(film->rect()) +
+                               ", announced were " + RectText(expected.rect));
+  }
+  if (!std::equal(film->layers().begin(), film->layers().end(), film_.layers().begin(),
+                  film_.layers().end())) {
+    return absl::DataLossError(name + " has other layers than the job");
+  }
+  film_.Paste(*film);
+  have_[tile.tile] = true;
+  return absl::OkStatus();
+}
+
+std::vector<uint32_t> Stitcher::Missing() const {
+  std::vector<uint32_t> missing;
+  for (size_t i = 0; i < have_.size(); ++i) {
+    if (!have_[i]) missing.push_back(static_cast<uint32_t>(i));
+  }
+  return missing;
+}
+
+}  // namespace farpoint
