@@ -32,5 +32,7 @@ class FakeClock final : public Clock {
 
 // Seconds of processor time that the calling thread has used.
 double ThreadCpuSeconds();
+// Seconds of processor time that all threads of the process have used.
+double ProcessCpuSeconds();
 
 }  // namespace farpoint

@@ -7,6 +7,7 @@
 
 #include "core/base/status.h"
 #include "core/image/layers.h"
+#include "core/pbgi/gather_params.h"
 
 namespace farpoint {
 
@@ -16,15 +17,6 @@ enum class Integrator : uint32_t {
   kDpbgi,  // pbgi with a smaller microbuffer ("degraded", paper §4)
   kPt,     // path tracing over the triangles: the ground truth
 };
-enum class BufferMap : uint32_t {
-  kOctahedral,  // the whole sphere, world-aligned
-  kCosine,      // the hemisphere about a receiver's normal, warped by the cosine (pbgi, dpbgi)
-};
-enum class Splat : uint32_t {
-  kCoverage,  // front to back, each node covers as much of a pixel as its solid angle
-  kOpaque,    // classic: a node fills the pixels that it touches, the nearest wins
-};
-
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
@@ -37,7 +29,7 @@ struct RenderSettings {
   Splat splat = Splat::kCoverage;
   uint32_t clusters = 0;        // k per block, 1..1024; 0: the default
   float epsilon = 0.1f;         // far: R_cluster < epsilon (d - r); >= 0
-  float normal_weight = 0.1f;   // alpha / squared block diagonal (paper §3.1)
+  float normal_weight = 1.0f;   // alpha / squared block diagonal (paper §3.1)
   uint32_t kmeans_iterations = 5;  // 0..100
   uint64_t seed = 0;
   std::vector<Layer> layers = DefaultLayers();

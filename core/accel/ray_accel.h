@@ -1,0 +1,61 @@
+// Ray queries against the triangles of a prepared scene. The only user of Embree.
+//
+// Determinism: Embree runs with isa=avx2 and the robust flag, and there is one kind of call for
+// each purpose (one ray at a time), so the same ray gives the same bits whatever the machine and
+// the number of threads.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <memory>
+#include <optional>
+
+#include "core/base/status.h"
+#include "core/scene/prepared_scene.h"
+
+namespace farpoint {
+
+struct RayHit {
+  float t;            // distance in units of the direction's length
+  uint32_t triangle;  // index into PreparedScene::triangles()
+  float b1, b2;       // barycentric weights of vertices 1 and 2
+};
+
+// Immutable after Build; thread-safe. Coordinates are relative to the scene's origin. Alpha masks
+// are holes. For performance the queries check nothing: inputs must be finite.
+class RayAccel {
+ public:
+  // kUnavailable if Embree reports an error (out of memory, no AVX2), with Embree's words.
+  static absl::StatusOr<std::shared_ptr<const RayAccel>> Build(
+      std::shared_ptr<const PreparedScene> scene);
+  ~RayAccel();
+  RayAccel(const RayAccel&) = delete;
+  RayAccel& operator=(const RayAccel&) = delete;
+
+  const PreparedScene& scene() const { return *scene_; }
+
+  // The nearest hit with 0 <= t <= t_max.
+  std::optional<RayHit> Intersect(const Vec3f& origin, const Vec3f& direction,
+                                  float t_max = std::numeric_limits<float>::infinity()) const;
+  // Whether anything lies at 0 <= t <= t_max.
+  bool Occluded(const Vec3f& origin, const Vec3f& direction,
+                float t_max = std::numeric_limits<float>::infinity()) const;
+
+  // Where a ray leaves a surface at `p` on the side of the unit geometric normal `ng`: p moved by
+  // 2^-19 of the scene's diagonal, about eight times the rounding error of a position, so that the
+  // ray does not hit the surface that it leaves. Proportional to the scene: no absolute length.
+  Vec3f LeaveSurface(const Vec3f& p, const Vec3f& ng) const {
+    return p + ng * surface_offset_m_;
+  }
+  float surface_offset_m() const { return surface_offset_m_; }
+
+ private:
+  explicit RayAccel(std::shared_ptr<const PreparedScene> scene);
+
+  struct Impl;
+  std::shared_ptr<const PreparedScene> scene_;
+  float surface_offset_m_ = 0;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace farpoint

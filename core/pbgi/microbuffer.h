@@ -1,0 +1,73 @@
+// Microbuffers: small images of the directions about a receiver, filled by splatting a cut
+// (paper §1.1, §3.2, §3.3), composited and convolved.
+//
+// Coverage splats (the default): nodes are taken front to back; a node covers of each pixel that it
+// touches the fraction alpha = Ω_node,pixel / Ω_pixel, Ω_node = A |n·w| / d², as long as the pixel
+// is not full. Opaque splats (the paper's): a node fills the pixels whose centres it covers, at
+// least the one of its own centre; the nearest wins.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <vector>
+
+#include "core/math/vec.h"
+#include "core/pbgi/gather_params.h"
+#include "core/pbgi/microbuffer_map.h"
+#include "core/pbgi/point_tree.h"
+#include "core/pbgi/tree_cut.h"
+
+namespace farpoint {
+
+// Radiance already weighted by coverage, coverage in [0, 1], depth of the nearest splat. Arrays
+// have map.padded() elements.
+class Microbuffer {
+ public:
+  explicit Microbuffer(const MicrobufferMap& map);
+
+  // Empty again. Takes O(pixels).
+  void Clear();
+  // No pixel has any coverage.
+  bool empty() const { return touched_ == 0; }
+
+  const MicrobufferMap& map() const { return *map_; }
+  float* radiance(int channel) { return values_[channel]; }
+  const float* radiance(int channel) const { return values_[channel]; }
+  float* coverage() { return values_[3]; }
+  const float* coverage() const { return values_[3]; }
+  float* depth() { return values_[4]; }  // metres; +inf where nothing is. Opaque splats only.
+  const float* depth() const { return values_[4]; }
+  void MarkTouched() { ++touched_; }
+  uint64_t touched() const { return touched_; }
+
+ private:
+  const MicrobufferMap* map_;
+  std::vector<float> storage_;
+  float* values_[5];
+  uint64_t touched_ = 0;
+};
+
+struct RasterCounters {
+  uint64_t splats = 0;         // nodes drawn
+  uint64_t exact_discs = 0;    // of them, drawn pixel by pixel as discs
+  uint64_t hidden_pixels = 0;  // pixel contributions that found the pixel full
+};
+
+// Draws `cut` (sorted front to back) as seen from `view` into `buffer`. For the cosine map the
+// hemisphere is the one about view.normal. Nodes below the horizon of the cosine map are left out.
+void RasterizeCut(const PointTree& tree, const CutView& view, std::span<const CutNode> cut,
+                  Splat splat, Microbuffer& buffer, RasterCounters& counters);
+
+// Irradiance [W/m²] at a receiver of normal `n` (world; ignored for the cosine map, whose frame is
+// the receiver's) from `far` seen through `near` (may be null):
+//   E = pi Σ w L / Σ w,   w = max(0, n·V_pixel),   L = L_near + (1 - C_near) L_far
+// with opaque splats composed by depth instead: the nearer of the two wins. A sum over all pixels
+// in a fixed order. The quotient makes a buffer of constant radiance exact for every normal.
+Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f& n, Splat splat);
+
+// The literal, slow versions: oracles of the tests.
+Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const Vec3f& n,
+                          Splat splat);
+
+}  // namespace farpoint

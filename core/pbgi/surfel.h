@@ -1,0 +1,33 @@
+// Surfels: disc samples of the scene's surfaces, the points of point-based GI.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "core/math/vec.h"
+
+namespace farpoint {
+
+// Structure of arrays; all of one length. Positions are relative to the scene's origin.
+struct SurfelCloud {
+  std::vector<Vec3f> position;
+  std::vector<Vec3f> normal;      // unit, geometric, by the winding: the front side
+  std::vector<float> area_m2;     // of the surface that the surfel stands for; sums to the scene's
+  std::vector<uint32_t> triangle;
+  std::vector<Vec2f> barycentric;  // weights of vertices 1 and 2
+
+  size_t size() const { return position.size(); }
+};
+
+// Which sides of a surfel block light and carry it. A side that no one outside a closed object
+// can see (it looks only at the object's own back faces) and that no light reaches would count as
+// a second, dark layer behind the visible front: it is left out of the gather.
+enum SurfelSide : uint8_t { kFrontVisible = 1, kBackVisible = 2 };
+
+// What the surfels reflect. All of one length, parallel to a SurfelCloud.
+struct SurfelShading {
+  std::vector<Rgb> front, back;       // reflected radiance, W/(m² sr), diffuse: the same all round
+  std::vector<uint8_t> visible_sides;  // SurfelSide bits
+};
+
+}  // namespace farpoint

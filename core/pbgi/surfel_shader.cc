@@ -1,0 +1,100 @@
+#include "core/pbgi/surfel_shader.h"
+
+#include <algorithm>
+
+#include "core/math/elementary.h"
+#include "core/math/sampling.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr uint32_t kInteriorRays = 4;
+constexpr size_t kPiece = 1024;
+
+struct PieceCounts {
+  uint64_t shadow = 0, interior = 0, inside = 0, black = 0;
+};
+
+// Whether all rays that leave `p` on the side of `ng` hit surfaces from behind.
+bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, uint64_t key,
+                       PieceCounts& counts) {
+  const Frame frame(ng);
+  const Vec3f origin = accel.LeaveSurface(p, ng);
+  const uint32_t seed = static_cast<uint32_t>(key);
+  for (uint32_t i = 0; i < kInteriorRays; ++i) {
+    const Vec3f w =
+        frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
+    ++counts.interior;
+    const std::optional<RayHit> hit = accel.Intersect(origin, w);
+    if (!hit || Dot(accel.scene().GeometricNormal(hit->triangle), w) < 0.0f) return false;
+  }
+  return true;
+}
+
+}  // namespace
+
+SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
+                           const LightSampler& lights, const ShadeOptions& options,
+                           Executor& executor, Stats& stats) {
+  const PreparedScene& scene = accel.scene();
+  const size_t n = cloud.size();
+  SurfelShading out;
+  out.front.resize(n);
+  out.back.resize(n);
+  out.visible_sides.resize(n);
+  const uint32_t samples =
+      std::max(1u, (options.light_samples + kSurfelLightShare - 1) / kSurfelLightShare);
+
+  std::vector<PieceCounts> piece_counts((n + kPiece - 1) / kPiece);
+  executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
+    PieceCounts& counts = piece_counts[begin / kPiece];
+    LightCounters light_counters;
+    for (size_t i = begin; i < end; ++i) {
+      const uint32_t t = cloud.triangle[i];
+      const Vec2f b = cloud.barycentric[i];
+      const Vec3f p = cloud.position[i];
+      const Rgb albedo = scene.Surface(t, b.x, b.y).albedo;
+      const Vec3f ns_front = scene.ShadingNormal(t, b.x, b.y);
+      const bool black = !(MaxComponent(albedo) > 0.0f);
+      // Seeded by what the surfel is, not by where it stands in the cloud.
+      const uint64_t key =
+          HashKey(options.seed, scene.objects()[scene.triangles()[t].object].content_key,
+                  t - scene.objects()[scene.triangles()[t].object].first_triangle,
+                  static_cast<uint64_t>(b.x * 16777216.0f));
+      uint8_t visible = 0;
+      for (int side = 0; side < 2; ++side) {
+        const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
+        const Vec3f ns = side == 0 ? ns_front : -ns_front;
+        const uint64_t side_key = HashKey(key, static_cast<uint64_t>(side));
+        const bool inside =
+            SeesOnlyBackFaces(accel, p, ng, HashKey(side_key, 5), counts);
+        if (inside) {
+          const Rgb probe = lights.Irradiance(p, ng, ns, 1, side_key, 0, 0, light_counters);
+          if (!(MaxComponent(probe) > 0.0f)) {
+            ++counts.inside;
+            continue;
+          }
+        }
+        visible |= side == 0 ? kFrontVisible : kBackVisible;
+        if (black && !options.no_skip) {
+          ++counts.black;
+          continue;
+        }
+        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters);
+        (side == 0 ? out.front : out.back)[i] = albedo * e * kInvPif;
+      }
+      out.visible_sides[i] = visible;
+    }
+    counts.shadow = light_counters.rays;
+  });
+  for (const PieceCounts& c : piece_counts) {
+    stats.counts["shadow_rays"] += c.shadow;
+    stats.counts["interior_rays"] += c.interior;
+    stats.skipped["surfel_sides_inside"] += c.inside;
+    stats.skipped["surfel_sides_black"] += c.black;
+  }
+  return out;
+}
+
+}  // namespace farpoint

@@ -1,0 +1,87 @@
+// Tree cuts: the level of detail of the scene that a receiver, or a whole cluster, sees
+// (paper §1.1, §3.2, §3.3).
+#pragma once
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "core/math/vec.h"
+#include "core/pbgi/gather_params.h"
+#include "core/pbgi/point_tree.h"
+
+namespace farpoint {
+
+// Who looks: one receiver, or all receivers of a cluster at once. A single receiver is the cluster
+// with radius 0, spread 0 and margin 0, so that both go through the same code.
+struct CutView {
+  Vec3f position;        // of the (active) receiver, relative to the scene's origin
+  Vec3f normal;          // unit; the receiver's, or the cluster's mean
+  float radius_m = 0;    // R_c: the farthest receiver from the active one
+  float sin_spread = 0;  // of the largest angle between a receiver's normal and `normal`;
+                         // 1 if that is 90° or more: then nothing lies below every horizon
+  float cos_spread = 1;
+  float margin_m = 0;    // max over receivers x of n_x·(p_active - p_x), at least 0: how far a
+                         // horizon lies below the active receiver's
+  // A receiver looks from the back of its own triangle: the sides that only such receivers can see
+  // (core/pbgi/surfel.h) count as visible.
+  bool sees_inside = false;
+};
+
+// When to descend.
+struct CutParams {
+  // far: R_c < epsilon (d - r); near: R_c >= epsilon (d + r) (§3.2 with its erratum, DESIGN §3:
+  // the measure γ = R_c / d is small for far nodes), everything between descends.
+  float epsilon = 0.1f;
+  // A node is fine enough if its sphere's solid angle pi r²/d² is at most that of one pixel in its
+  // direction. kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
+  BufferMap map = BufferMap::kOctahedral;
+  float pixel_sr = 0.01f;
+};
+
+// A node of a cut.
+struct CutNode {
+  uint32_t slot;      // group * 8 + lane
+  float distance_m;   // from the view's position to the node's centre
+};
+
+// A node where the traversal stopped because it is near some receiver of the cluster.
+struct NearNode {
+  uint32_t slot;
+  int32_t level;
+};
+
+struct CutCounters {
+  uint64_t groups_visited = 0;  // eight node tests each
+  uint64_t below_horizon = 0;   // nodes culled: below every receiver's horizon
+  uint64_t invisible_side = 0;  // nodes culled: only sides that cannot be seen
+};
+
+// The cut seen from `view`, starting at the root: nodes that are fine enough, or surfels, appended
+// to `far` in traversal order; with radius_m > 0, nodes too near to share appended to `near`.
+// With radius 0 and no sharing wanted, pass near = nullptr: everything goes to `far`.
+void ComputeClusterCut(const PointTree& tree, const CutView& view, const CutParams& params,
+                       std::vector<CutNode>& far, std::vector<NearNode>* near,
+                       CutCounters& counters);
+
+// The cut of one receiver below the near nodes of its cluster's cut (§3.3).
+// `near_groups` is the packed form of the near nodes (PackNearNodes).
+struct PackedNearNodes {
+  std::vector<NodeGroup> groups;   // copies, eight to a group, rest empty
+  std::vector<NearNode> nodes;     // parallel to the lanes
+  void Pack(const PointTree& tree, std::span<const NearNode> near);
+};
+void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutParams& params,
+                        const PackedNearNodes& near, std::vector<CutNode>& cut,
+                        CutCounters& counters);
+
+// The literal, slow version of both: one node at a time, recursive, straight from the paper and
+// the rules above. The oracle of the tests.
+void ComputeClusterCutLiteral(const PointTree& tree, const CutView& view, const CutParams& params,
+                              std::vector<CutNode>& far, std::vector<NearNode>* near);
+
+// Orders a cut front to back: by distance to within 2^-7, ties by traversal order. Stable and
+// deterministic; linear.
+void SortFrontToBack(std::vector<CutNode>& cut, std::vector<CutNode>& scratch);
+
+}  // namespace farpoint

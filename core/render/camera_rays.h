@@ -1,0 +1,34 @@
+// Primary rays of a perspective camera.
+#pragma once
+
+#include "core/image/tile_rect.h"
+#include "core/math/elementary.h"
+#include "core/scene/scene.h"
+
+namespace farpoint {
+
+// Pixel (0, 0) is the top left; x to the right, y down. Square pixels.
+class CameraRays {
+ public:
+  CameraRays(const Camera& camera, const FilmSpec& film, const Vec3d& scene_origin)
+      : eye_(camera.eye - scene_origin), forward_(camera.forward),
+        right_(camera.right), up_(camera.up), width_(film.width), height_(film.height),
+        half_height_(DetTan(0.5 * camera.yfov_rad)) {}
+
+  // Relative to the scene's origin.
+  Vec3f eye() const { return Vec3f(eye_); }
+  // Unit direction through the point (x, y) of the raster, in pixels.
+  Vec3f Direction(double x, double y) const {
+    const double v = half_height_ * (1.0 - 2.0 * y / height_);
+    const double u = half_height_ * (2.0 * x - width_) / height_;
+    return Vec3f(Normalize(forward_ + right_ * u + up_ * v));
+  }
+  // Distance along the camera's axis.
+  float Depth(const Vec3f& p) const { return static_cast<float>(Dot(Vec3d(p) - eye_, forward_)); }
+
+ private:
+  Vec3d eye_, forward_, right_, up_;
+  double width_, height_, half_height_;
+};
+
+}  // namespace farpoint

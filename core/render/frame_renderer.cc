@@ -1,0 +1,550 @@
+#include "core/render/frame_renderer.h"
+
+#include <x86intrin.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <mutex>
+#include <optional>
+
+#include "core/base/clock.h"
+#include "core/math/sampling.h"
+#include "core/pbgi/microbuffer.h"
+#include "core/pbgi/microbuffer_map.h"
+#include "core/pbgi/receiver_cluster.h"
+#include "core/pbgi/tree_cut.h"
+#include "core/render/camera_rays.h"
+#include "core/render/loaded_scene.h"
+#include "core/render/path_tracer.h"
+
+namespace farpoint {
+
+namespace {
+
+// Keys of independent random choices.
+enum : uint64_t { kKeyPixel = 1, kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
+
+// Thread-seconds by stage. A stage is measured in clock ticks, which are cheap to read thousands
+// of times; the sum is scaled to the block's processor time at the end.
+class StageClock {
+ public:
+  StageClock() : cpu_(ThreadCpuSeconds()), start_(__rdtsc()), last_(start_) {}
+  // What ran since the last call belongs to `stage`.
+  void Charge(Stage stage) {
+    const uint64_t now = __rdtsc();
+    ticks_[static_cast<int>(stage)] += now - last_;
+    last_ = now;
+  }
+  void Finish(Stats& stats) {
+    const double total = static_cast<double>(std::max<uint64_t>(1, last_ - start_));
+    const double cpu = ThreadCpuSeconds() - cpu_;
+    for (int i = 0; i < kStageCount; ++i) {
+      stats.seconds[i] += cpu * static_cast<double>(ticks_[i]) / total;
+    }
+  }
+
+ private:
+  double cpu_;
+  uint64_t start_, last_;
+  uint64_t ticks_[kStageCount] = {};
+};
+
+struct Counters {
+  uint64_t receivers = 0, clusters = 0, cut_nodes = 0, rays = 0, node_visits = 0, splats = 0;
+  uint64_t exact_discs = 0;
+  uint64_t skipped_no_receivers = 0, skipped_black = 0, skipped_unlit = 0, skipped_shadow = 0;
+  uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
+};
+
+// One image sample: where the primary ray went.
+struct Sample {
+  bool hit = false;
+  Rgb albedo, emission;
+  float depth = std::numeric_limits<float>::infinity();
+  uint32_t receiver = ~0u;  // index among the block's receivers
+  Rgb direct_e, indirect_e, standard_error;
+  float cluster = -1, cut_size = 0;
+};
+
+class Renderer final : public FrameRenderer {
+ public:
+  Renderer(std::shared_ptr<const LoadedScene> scene, const FrameSpec& frame)
+      : holder_(std::move(scene)), scene_(static_cast<const LoadedSceneData&>(*holder_)),
+        frame_(frame), settings_(frame.settings),
+        rays_(frame.camera, frame.film, scene_.scene->origin()),
+        map_(settings_.buffer_map, settings_.microbuffer_px()) {
+    cut_params_.epsilon = settings_.epsilon;
+    cut_params_.map = settings_.buffer_map;
+    cut_params_.pixel_sr = map_.reference_solid_angle();
+    const auto wants = [&](Layer layer) {
+      return std::find(settings_.layers.begin(), settings_.layers.end(), layer) !=
+             settings_.layers.end();
+    };
+    wants_irradiance_ = wants(Layer::kIrradiance) || wants(Layer::kStdError) ||
+                        wants(Layer::kCutSize);
+    wants_direct_irradiance_ = wants(Layer::kDirectIrradiance);
+    wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
+                      wants(Layer::kCluster);
+    wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
+  }
+
+  absl::StatusOr<TileOutput> RenderTile(const PixelRect& tile, Executor& executor,
+                                        const std::function<void(int, int)>& progress,
+                                        const std::atomic<bool>* cancel) const override {
+    if (tile.empty() || !frame_.film.crop.Contains(tile)) {
+      return absl::InvalidArgumentError("the tile lies outside the frame's crop");
+    }
+    const auto wall_start = std::chrono::steady_clock::now();
+    TileOutput out;
+    out.film = Film(tile, settings_.layers);
+    const std::vector<PixelRect> blocks = BlocksOf(tile, frame_.film.frame());
+    std::vector<Stats> block_stats(blocks.size());
+    std::atomic<bool> finite{true}, cancelled{false};
+    std::mutex progress_mutex;
+    int done = 0;
+    executor.ForEach(blocks.size(), 1, [&](size_t i) {
+      if (cancel != nullptr && cancel->load(std::memory_order_relaxed)) {
+        cancelled = true;
+        return;
+      }
+      if (!RenderBlock(blocks[i], tile, out.film, block_stats[i])) finite = false;
+      if (progress) {
+        const std::lock_guard lock(progress_mutex);
+        progress(++done, static_cast<int>(blocks.size()));
+      }
+    });
+    if (cancelled) return absl::CancelledError("the tile was cancelled");
+    if (!finite) {
+      return absl::InternalError("tile at " + std::to_string(tile.x0) + "," +
+                                 std::to_string(tile.y0) +
+                                 ": a pixel is not finite; this is a defect of farpoint");
+    }
+    for (const Stats& s : block_stats) out.stats += s;
+    const double wall =
+        std::chrono::duration<double>(std::chrono::steady_clock::now() - wall_start).count();
+    double sum = 0;
+    for (const double s : out.stats.seconds) sum += s;
+    for (int i = 0; i < kStageCount && sum > 0; ++i) {
+      out.stats.wall_seconds[i] = wall * out.stats.seconds[i] / sum;
+    }
+    out.film.RoundToStorage();
+    return out;
+  }
+
+ private:
+  // False if a value is not finite.
+  bool RenderBlock(const PixelRect& block, const PixelRect& tile, Film& film, Stats& stats) const {
+    StageClock clock;
+    Counters n;
+    const uint32_t spp = settings_.spp;
+    std::vector<Sample> samples(static_cast<size_t>(block.area()) * spp);
+    std::vector<Receiver> receivers;
+    std::vector<uint32_t> sample_of;  // of each receiver
+    TracePrimary(block, samples, receivers, sample_of, n);
+    clock.Charge(Stage::kPrimary);
+
+    // The samples to be computed: those of pixels inside the tile. Clusters are made of all
+    // receivers of the block, so that a tile or a crop changes nothing.
+    const PixelRect inside = block.Intersect(tile);
+    std::vector<uint8_t> wanted(receivers.size());
+    for (size_t r = 0; r < receivers.size(); ++r) {
+      const int64_t pixel = sample_of[r] / spp;
+      wanted[r] = inside.Contains(block.x0 + static_cast<int>(pixel % block.width()),
+                                  block.y0 + static_cast<int>(pixel / block.width()));
+      n.receivers += wanted[r];
+    }
+    if (receivers.empty()) n.skipped_no_receivers = 1;
+
+    if (wants_direct_ && scene_.lights->any_light()) {
+      Direct(block, samples, receivers, sample_of, wanted, n);
+    }
+    clock.Charge(Stage::kDirect);
+
+    if (wants_indirect_ && !receivers.empty()) {
+      // A receiver whose albedo is black shows no indirect light; it is gathered only if its
+      // irradiance itself was asked for.
+      if (!wants_irradiance_ && !settings_.no_skip) {
+        for (size_t r = 0; r < receivers.size(); ++r) {
+          if (wanted[r] && !(MaxComponent(samples[sample_of[r]].albedo) > 0.0f)) {
+            wanted[r] = 0;
+            ++n.skipped_black;
+          }
+        }
+      }
+      if (settings_.integrator == Integrator::kPt) {
+        TracePaths(block, samples, receivers, sample_of, wanted, n);
+        clock.Charge(Stage::kTrace);
+      } else {
+        Gather(block, samples, receivers, sample_of, wanted, n, clock);
+      }
+    }
+
+    const bool finite = Develop(block, inside, samples, receivers, film);
+    clock.Charge(Stage::kConvolve);
+    clock.Finish(stats);
+    Report(n, stats);
+    return finite;
+  }
+
+  // Position of sample s of a pixel, in [0, 1)²; the centre if there is only one.
+  Vec2f SamplePosition(int x, int y, uint32_t s) const {
+    if (settings_.spp == 1) return {0.5f, 0.5f};
+    const uint32_t seed = static_cast<uint32_t>(
+        HashKey(settings_.seed, kKeyPixel, static_cast<uint64_t>(x), static_cast<uint64_t>(y)));
+    return {OwenSobol(s, 0, seed), OwenSobol(s, 1, seed)};
+  }
+
+  void TracePrimary(const PixelRect& block, std::vector<Sample>& samples,
+                    std::vector<Receiver>& receivers, std::vector<uint32_t>& sample_of,
+                    Counters& n) const {
+    const PreparedScene& scene = *scene_.scene;
+    size_t at = 0;
+    for (int y = block.y0; y < block.y1; ++y) {
+      for (int x = block.x0; x < block.x1; ++x) {
+        for (uint32_t s = 0; s < settings_.spp; ++s, ++at) {
+          const Vec2f offset = SamplePosition(x, y, s);
+          const Vec3f w = rays_.Direction(x + static_cast<double>(offset.x),
+                                          y + static_cast<double>(offset.y));
+          ++n.rays;
+          const std::optional<RayHit> hit = scene_.accel->Intersect(rays_.eye(), w);
+          Sample& sample = samples[at];
+          if (!hit) continue;
+          const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
+          sample.hit = true;
+          sample.albedo = surface.albedo;
+          sample.emission = surface.emission;
+          sample.receiver = static_cast<uint32_t>(receivers.size());
+          Receiver r;
+          r.position = scene.PointOn(hit->triangle, hit->b1, hit->b2);
+          r.geometric_normal = scene.GeometricNormal(hit->triangle);
+          r.normal = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
+          r.on_back = Dot(r.geometric_normal, w) > 0.0f;
+          if (r.on_back) {
+            r.geometric_normal = -r.geometric_normal;
+            r.normal = -r.normal;
+          }
+          sample.depth = rays_.Depth(r.position);
+          receivers.push_back(r);
+          sample_of.push_back(static_cast<uint32_t>(at));
+        }
+      }
+    }
+  }
+
+  uint64_t PixelKey(const PixelRect& block, uint32_t sample, uint64_t purpose) const {
+    const uint64_t pixel = sample / settings_.spp;
+    return HashKey(settings_.seed, purpose,
+                   static_cast<uint64_t>(block.x0) + pixel % static_cast<uint64_t>(block.width()),
+                   static_cast<uint64_t>(block.y0) + pixel / static_cast<uint64_t>(block.width()));
+  }
+
+  void Direct(const PixelRect& block, std::vector<Sample>& samples,
+              const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
+              const std::vector<uint8_t>& wanted, Counters& n) const {
+    // The samples of a pixel share its shadow rays out among them: one stratified set.
+    const uint32_t each = (settings_.light_samples + settings_.spp - 1) / settings_.spp;
+    LightCounters counters;
+    for (size_t r = 0; r < receivers.size(); ++r) {
+      if (!wanted[r]) continue;
+      Sample& sample = samples[sample_of[r]];
+      const bool black = !(MaxComponent(sample.albedo) > 0.0f);
+      if (black && !wants_direct_irradiance_ && !settings_.no_skip) {
+        ++n.skipped_black;
+        continue;
+      }
+      sample.direct_e = scene_.lights->Irradiance(
+          receivers[r].position, receivers[r].geometric_normal, receivers[r].normal, each,
+          PixelKey(block, sample_of[r], kKeyDirect), (sample_of[r] % settings_.spp) * each, 0,
+          counters);
+    }
+    n.rays += counters.rays;
+    n.skipped_shadow += counters.skipped_facing_away;
+  }
+
+  void TracePaths(const PixelRect& block, std::vector<Sample>& samples,
+                  const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
+                  const std::vector<uint8_t>& wanted, Counters& n) const {
+    if (!scene_.lights->any_light() && !settings_.no_skip) {
+      n.skipped_unlit += receivers.size();
+      return;
+    }
+    LightCounters counters;
+    for (size_t r = 0; r < receivers.size(); ++r) {
+      if (!wanted[r]) continue;
+      const TracedIrradiance traced = TraceIndirect(
+          *scene_.accel, *scene_.lights, receivers[r], settings_.paths,
+          HashKey(PixelKey(block, sample_of[r], kKeyPath), sample_of[r] % settings_.spp), counters,
+          n.rays);
+      samples[sample_of[r]].indirect_e = traced.irradiance;
+      samples[sample_of[r]].standard_error = traced.standard_error;
+    }
+    n.rays += counters.rays;
+    n.skipped_shadow += counters.skipped_facing_away;
+  }
+
+  void Gather(const PixelRect& block, std::vector<Sample>& samples,
+              const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
+              const std::vector<uint8_t>& wanted, Counters& n, StageClock& clock) const {
+    const PointTree& tree = *scene_.tree;
+    if (!tree.lit() && !settings_.no_skip) {
+      n.skipped_unlit += receivers.size();
+      return;
+    }
+    std::vector<ReceiverCluster> clusters;
+    if (settings_.integrator == Integrator::kFpbgi) {
+      ClusterParams params;
+      params.k = settings_.clusters_per_block();
+      params.iterations = settings_.kmeans_iterations;
+      params.normal_weight = settings_.normal_weight;
+      params.seed_key = HashKey(settings_.seed, kKeyCluster,
+                                static_cast<uint64_t>(block.x0 / kBlockSize),
+                                static_cast<uint64_t>(block.y0 / kBlockSize));
+      clusters = ClusterReceivers(receivers, params);
+      clock.Charge(Stage::kCluster);
+    } else {
+      // pbgi: every receiver is a cluster of its own.
+      for (uint32_t r = 0; r < receivers.size(); ++r) {
+        ReceiverCluster c;
+        c.members = {r};
+        c.active = r;
+        c.mean_normal = receivers[r].normal;
+        c.radius_m = c.sin_spread = c.margin_m = 0;
+        c.cos_spread = 1;
+        c.sees_inside = receivers[r].on_back;
+        clusters.push_back(std::move(c));
+      }
+    }
+
+    Microbuffer far_buffer(map_), near_buffer(map_);
+    std::vector<CutNode> cut, scratch;
+    std::vector<NearNode> near;
+    PackedNearNodes packed;
+    CutCounters cut_counters;
+    RasterCounters raster_counters;
+    for (size_t c = 0; c < clusters.size(); ++c) {
+      const ReceiverCluster& cluster = clusters[c];
+      const bool any = std::any_of(cluster.members.begin(), cluster.members.end(),
+                                   [&](uint32_t r) { return wanted[r] != 0; });
+      if (!any) continue;
+      ++n.clusters;
+      // Cluster cut and microbuffer (paper §3.2). Where there is nothing to share, all is far.
+      const bool alone = cluster.members.size() == 1;
+      CutView view;
+      view.position = receivers[cluster.active].position;
+      view.normal = cluster.mean_normal;
+      view.radius_m = cluster.radius_m;
+      view.sin_spread = cluster.sin_spread;
+      view.cos_spread = cluster.cos_spread;
+      view.margin_m = cluster.margin_m;
+      view.sees_inside = cluster.sees_inside;
+      cut.clear();
+      near.clear();
+      ComputeClusterCut(tree, view, cut_params_, cut, alone ? nullptr : &near, cut_counters);
+      n.cut_nodes += cut.size() + near.size();
+      const size_t shared_nodes = cut.size();
+      clock.Charge(Stage::kCut);
+      far_buffer.Clear();
+      SortFrontToBack(cut, scratch);
+      RasterizeCut(tree, view, cut, settings_.splat, far_buffer, raster_counters);
+      clock.Charge(Stage::kRaster);
+      packed.Pack(tree, near);
+      clock.Charge(Stage::kCut);
+
+      // Receiver cuts and microbuffers, composite, convolution (§3.3).
+      for (const uint32_t r : cluster.members) {
+        if (!wanted[r]) continue;
+        Sample& sample = samples[sample_of[r]];
+        sample.cluster = static_cast<float>(c);
+        const Microbuffer* own = nullptr;
+        size_t own_nodes = 0;
+        if (!near.empty()) {
+          CutView receiver_view;
+          receiver_view.position = receivers[r].position;
+          receiver_view.normal = receivers[r].normal;
+          receiver_view.sees_inside = receivers[r].on_back;
+          cut.clear();
+          ComputeReceiverCut(tree, receiver_view, cut_params_, packed, cut, cut_counters);
+          own_nodes = cut.size();
+          n.cut_nodes += cut.size();
+          clock.Charge(Stage::kCut);
+          if (!cut.empty()) {
+            near_buffer.Clear();
+            SortFrontToBack(cut, scratch);
+            RasterizeCut(tree, receiver_view, cut, settings_.splat, near_buffer, raster_counters);
+            if (!near_buffer.empty()) own = &near_buffer;
+            clock.Charge(Stage::kRaster);
+          }
+        }
+        sample.cut_size = static_cast<float>(alone ? shared_nodes : own_nodes);
+        sample.indirect_e = ConvolveCosine(far_buffer, own, receivers[r].normal, settings_.splat);
+        clock.Charge(Stage::kConvolve);
+      }
+    }
+    n.node_visits += cut_counters.groups_visited * kLanes;
+    n.skipped_horizon += cut_counters.below_horizon;
+    n.skipped_invisible += cut_counters.invisible_side;
+    n.splats += raster_counters.splats;
+    n.exact_discs += raster_counters.exact_discs;
+    n.skipped_hidden += raster_counters.hidden_pixels;
+  }
+
+  // Samples to pixels, by a box filter. False if a value is not finite.
+  bool Develop(const PixelRect& block, const PixelRect& inside, const std::vector<Sample>& samples,
+               const std::vector<Receiver>& receivers, Film& film) const {
+    const uint32_t spp = settings_.spp;
+    const float inverse_spp = 1.0f / static_cast<float>(spp);
+    const Rgb sky = scene_.scene->sky();
+    const Vec3d origin = scene_.scene->origin();
+    bool finite = true;
+    for (int y = inside.y0; y < inside.y1; ++y) {
+      for (int x = inside.x0; x < inside.x1; ++x) {
+        const size_t first =
+            (static_cast<size_t>(y - block.y0) * static_cast<size_t>(block.width()) +
+             static_cast<size_t>(x - block.x0)) * spp;
+        Rgb direct, indirect, emission, albedo, irradiance, direct_irradiance, error;
+        Vec3f normal;
+        Vec3d position;
+        float depth = 0, cluster = 0, cut_size = 0;
+        uint32_t hits = 0;
+        for (uint32_t s = 0; s < spp; ++s) {
+          const Sample& sample = samples[first + s];
+          if (!sample.hit) {
+            emission += sky;
+            continue;
+          }
+          ++hits;
+          const Receiver& r = receivers[sample.receiver];
+          direct += sample.albedo * sample.direct_e * kInvPif;
+          indirect += sample.albedo * sample.indirect_e * kInvPif;
+          emission += sample.emission;
+          albedo += sample.albedo;
+          irradiance += sample.indirect_e;
+          direct_irradiance += sample.direct_e;
+          error += sample.standard_error * sample.standard_error;
+          normal += r.normal;
+          position += Vec3d(r.position) + origin;
+          depth += sample.depth;
+          cluster += sample.cluster;
+          cut_size += sample.cut_size;
+        }
+        direct *= inverse_spp;
+        indirect *= inverse_spp;
+        emission *= inverse_spp;
+        albedo *= inverse_spp;
+        // Of what was hit: geometry, and irradiance, which background does not have.
+        const float inverse_hits = hits > 0 ? 1.0f / static_cast<float>(hits) : 0.0f;
+        irradiance *= inverse_hits;
+        direct_irradiance *= inverse_hits;
+        const Rgb se = Rgb(std::sqrt(error.x), std::sqrt(error.y), std::sqrt(error.z)) *
+                       inverse_hits;
+        const Rgb beauty = direct + indirect + emission;
+        finite = finite && IsFinite(beauty) && IsFinite(irradiance) && IsFinite(direct_irradiance);
+        const Vec3f p(position * static_cast<double>(inverse_hits));
+        const float alpha = static_cast<float>(hits) * inverse_spp;
+        for (const Layer layer : film.layers()) {
+          const auto set = [&](const Vec3f& v) {
+            const float values[3] = {v.x, v.y, v.z};
+            film.Set(layer, x, y, values);
+          };
+          const auto set1 = [&](float v) { film.Set(layer, x, y, std::span<const float>(&v, 1)); };
+          switch (layer) {
+            case Layer::kBeauty: {
+              const float values[4] = {beauty.x, beauty.y, beauty.z, alpha};
+              film.Set(layer, x, y, values);
+              break;
+            }
+            case Layer::kDirect: set(direct); break;
+            case Layer::kIndirect: set(indirect); break;
+            case Layer::kEmission: set(emission); break;
+            case Layer::kAlbedo: set(albedo); break;
+            case Layer::kNormal: set(NormalizeOr(normal, Vec3f())); break;
+            case Layer::kPosition: set(hits > 0 ? p : Vec3f()); break;
+            case Layer::kDepth:
+              set1(hits > 0 ? depth * inverse_hits : std::numeric_limits<float>::infinity());
+              break;
+            case Layer::kIrradiance: set(irradiance); break;
+            case Layer::kDirectIrradiance: set(direct_irradiance); break;
+            case Layer::kStdError: set(se); break;
+            case Layer::kCluster: set1(hits > 0 ? cluster * inverse_hits : -1.0f); break;
+            case Layer::kCutSize: set1(cut_size * inverse_hits); break;
+          }
+        }
+      }
+    }
+    return finite;
+  }
+
+  static void Report(const Counters& n, Stats& stats) {
+    stats.counts["receivers"] += n.receivers;
+    stats.counts["blocks"] += 1;
+    stats.counts["clusters"] += n.clusters;
+    stats.counts["cut_nodes"] += n.cut_nodes;
+    stats.counts["rays"] += n.rays;
+    stats.counts["node_visits"] += n.node_visits;
+    stats.counts["splats"] += n.splats;
+    stats.counts["exact_discs"] += n.exact_discs;
+    stats.skipped["blocks_without_receivers"] += n.skipped_no_receivers;
+    stats.skipped["black_receivers"] += n.skipped_black;
+    stats.skipped["unlit_receivers"] += n.skipped_unlit;
+    stats.skipped["shadow_rays"] += n.skipped_shadow;
+    stats.skipped["nodes_below_horizon"] += n.skipped_horizon;
+    stats.skipped["nodes_invisible_side"] += n.skipped_invisible;
+    stats.skipped["pixels_hidden"] += n.skipped_hidden;
+  }
+
+  std::shared_ptr<const LoadedScene> holder_;
+  const LoadedSceneData& scene_;
+  FrameSpec frame_;
+  RenderSettings settings_;
+  CameraRays rays_;
+  MicrobufferMap map_;
+  CutParams cut_params_;
+  bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
+};
+
+bool IsRotation(const Camera& c) {
+  const auto near = [](double a, double b) { return std::fabs(a - b) < 1e-6; };
+  return near(Length2(c.right), 1) && near(Length2(c.up), 1) && near(Length2(c.forward), 1) &&
+         near(Dot(c.right, c.up), 0) && near(Dot(c.right, c.forward), 0) &&
+         near(Dot(c.up, c.forward), 0);
+}
+
+}  // namespace
+
+absl::StatusOr<std::shared_ptr<const LoadedScene>> LoadedScene::Load(const BakedScene& blobs,
+                                                                     Executor& executor) {
+  (void)executor;  // Embree builds on its own threads
+  auto loaded = std::make_shared<LoadedSceneData>();
+  FP_ASSIGN_OR_RETURN(loaded->scene, PreparedScene::FromBlob(blobs.prepared_scene));
+  FP_ASSIGN_OR_RETURN(loaded->accel, RayAccel::Build(loaded->scene));
+  loaded->lights = std::make_unique<LightSampler>(loaded->accel);
+  if (blobs.tree_topology.size() != 0) {
+    FP_ASSIGN_OR_RETURN(loaded->tree,
+                        PointTree::FromBlobs(blobs.tree_topology, blobs.tree_radiance));
+  }
+  return std::shared_ptr<const LoadedScene>(std::move(loaded));
+}
+
+absl::StatusOr<std::unique_ptr<FrameRenderer>> FrameRenderer::Create(
+    std::shared_ptr<const LoadedScene> scene, const FrameSpec& frame) {
+  FP_RETURN_IF_ERROR(ValidateSettings(frame.settings));
+  FP_RETURN_IF_ERROR(ValidateFilm(frame.film));
+  const Camera& c = frame.camera;
+  if (!IsFinite(c.eye) || !IsRotation(c)) {
+    return absl::InvalidArgumentError(
+        "camera: eye must be finite and right, up, forward orthonormal");
+  }
+  if (!(c.yfov_rad > 0.0) || !(c.yfov_rad < 3.1)) {
+    return absl::InvalidArgumentError(
+        "camera: the vertical field of view must lie between 0 and 177 degrees");
+  }
+  if (frame.settings.integrator != Integrator::kPt &&
+      static_cast<const LoadedSceneData&>(*scene).tree == nullptr) {
+    return absl::FailedPreconditionError(
+        "a point-based integrator needs a point tree, and the scene was baked without one");
+  }
+  return std::unique_ptr<FrameRenderer>(std::make_unique<Renderer>(std::move(scene), frame));
+}
+
+}  // namespace farpoint

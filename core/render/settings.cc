@@ -1,0 +1,111 @@
+#include "core/render/settings.h"
+
+#include <array>
+#include <cmath>
+
+#include "core/image/tile_rect.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr uint32_t kDefaultMicrobuffer = 32;
+constexpr uint32_t kDefaultDegradedMicrobuffer = 16;
+constexpr uint32_t kDefaultClusters = 100;
+
+constexpr std::array<std::string_view, 4> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt"};
+
+template <typename T>
+absl::Status CheckRange(std::string_view name, T value, T low, T high) {
+  if (value >= low && value <= high) return absl::OkStatus();
+  return absl::InvalidArgumentError(std::string(name) + " is " + std::to_string(value) +
+                                    "; allowed is " + std::to_string(low) + " to " +
+                                    std::to_string(high));
+}
+
+}  // namespace
+
+uint32_t RenderSettings::microbuffer_px() const {
+  if (microbuffer != 0) return microbuffer;
+  return integrator == Integrator::kDpbgi ? kDefaultDegradedMicrobuffer : kDefaultMicrobuffer;
+}
+
+uint32_t RenderSettings::clusters_per_block() const {
+  return clusters != 0 ? clusters : kDefaultClusters;
+}
+
+absl::Status ValidateSettings(const RenderSettings& s) {
+  if (static_cast<uint32_t>(s.integrator) >= kIntegratorNames.size()) {
+    return absl::InvalidArgumentError("integrator: unknown value; use fpbgi, pbgi, dpbgi or pt");
+  }
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("spp", s.spp, 1, 256));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("paths", s.paths, 1, 1u << 20));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("light-samples", s.light_samples, 1, 4096));
+  FP_RETURN_IF_ERROR(CheckRange<uint64_t>("points", s.points, 0, uint64_t{1} << 31));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("microbuffer", s.microbuffer, 0, 256));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("clusters", s.clusters, 0, 1024));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("kmeans-iterations", s.kmeans_iterations, 0, 100));
+  if (!(s.epsilon >= 0.0f) || !std::isfinite(s.epsilon)) {
+    return absl::InvalidArgumentError("epsilon must be a finite number of at least 0");
+  }
+  if (!(s.normal_weight >= 0.0f) || !std::isfinite(s.normal_weight)) {
+    return absl::InvalidArgumentError("normal-weight must be a finite number of at least 0");
+  }
+  if (s.buffer_map != BufferMap::kOctahedral && s.buffer_map != BufferMap::kCosine) {
+    return absl::InvalidArgumentError("buffer-map: unknown value; use octahedral or cosine");
+  }
+  if (s.splat != Splat::kCoverage && s.splat != Splat::kOpaque) {
+    return absl::InvalidArgumentError("splat: unknown value; use coverage or opaque");
+  }
+  if (s.integrator == Integrator::kFpbgi && s.buffer_map == BufferMap::kCosine) {
+    return absl::InvalidArgumentError(
+        "buffer-map cosine is the hemisphere of one receiver and cannot be shared by a cluster; "
+        "use octahedral with fpbgi, or pbgi with cosine");
+  }
+  if (s.tile_px == 0 || s.tile_px % kBlockSize != 0 || s.tile_px > 65536) {
+    return absl::InvalidArgumentError("tile is " + std::to_string(s.tile_px) +
+                                      "; it must be a multiple of " + std::to_string(kBlockSize) +
+                                      " up to 65536");
+  }
+  if (s.layers.empty()) return absl::InvalidArgumentError("aov: no layer is asked for");
+  for (const Layer layer : s.layers) {
+    if (static_cast<uint32_t>(layer) >= kLayerCount) {
+      return absl::InvalidArgumentError("aov: unknown layer");
+    }
+    if (layer == Layer::kStdError && s.integrator != Integrator::kPt) {
+      return absl::InvalidArgumentError("layer '" + std::string(InfoOf(layer).name) +
+                                        "' is the path tracer's; use --integrator pt with it");
+    }
+    if (layer == Layer::kCluster && s.integrator != Integrator::kFpbgi) {
+      return absl::InvalidArgumentError("layer 'cluster' needs --integrator fpbgi");
+    }
+    if (layer == Layer::kCutSize && s.integrator == Integrator::kPt) {
+      return absl::InvalidArgumentError("layer 'cutsize' needs a point-based integrator, not pt");
+    }
+  }
+  return absl::OkStatus();
+}
+
+void ApplyPaperPreset(RenderSettings& s) {
+  s.buffer_map = BufferMap::kOctahedral;
+  s.splat = Splat::kOpaque;
+  s.clusters = 100;
+  s.epsilon = 0.1f;
+  s.normal_weight = 1.0f;
+  s.kmeans_iterations = 5;
+  s.microbuffer = 24;
+}
+
+absl::StatusOr<Integrator> IntegratorFromName(std::string_view name) {
+  for (size_t i = 0; i < kIntegratorNames.size(); ++i) {
+    if (kIntegratorNames[i] == name) return static_cast<Integrator>(i);
+  }
+  return absl::InvalidArgumentError("unknown integrator '" + std::string(name) +
+                                    "'; use fpbgi, pbgi, dpbgi or pt");
+}
+
+std::string_view NameOf(Integrator integrator) {
+  return kIntegratorNames[static_cast<size_t>(integrator)];
+}
+
+}  // namespace farpoint
