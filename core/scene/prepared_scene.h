@@ -2,7 +2,9 @@
 // that coordinator and workers share by its SHA-256 (byte format: docs/protocol.md).
 //
 // Positions are float offsets from `origin` (the centre of the world bounding box, in double), so
-// that a scene far from zero loses no precision. Triangles of degenerate area are kept out.
+// that a scene far from zero loses no precision. Triangles of degenerate area are kept out: what
+// is left has an area and a normal in float. Scaling a scene by a power of two scales positions
+// and lengths exactly and leaves all else as it is, bit by bit. Immutable, so thread-safe.
 #pragma once
 
 #include <array>
@@ -30,8 +32,9 @@ struct PreparedObject {
   uint64_t first_triangle, triangle_count;
   uint32_t material;
   uint32_t has_normals;   // 1: vertex normals are valid; 0: flat
-  uint64_t content_key;   // hash of the mesh's geometry and the instance's linear transform: seeds
-                          // sampling, unchanged when the object only moves or its peers change
+  uint64_t content_key;   // hash of the mesh's geometry and the instance's linear transform, each
+                          // without its power of two: seeds sampling, unchanged when the object
+                          // only moves, its peers change or the scene is scaled by 2^n
 };
 
 struct PreparedMaterial {
@@ -74,7 +77,10 @@ struct SurfaceSample {
 class PreparedScene {
  public:
   // Flattens, decodes the textures that are used, drops degenerate triangles, checks that all is
-  // finite. kInvalidArgument names mesh and instance, kResourceExhausted a limit.
+  // finite. kInvalidArgument names mesh and instance, kResourceExhausted a limit. A scene's extent
+  // must lie within 2^-30 and 2^60 m, so that areas and squared distances are normal floats.
+  // Mirrored instances keep the front of their faces: their triangles are wound the other way.
+  // The front of vertex normals that are zero or not finite is made up from the triangles.
   static absl::StatusOr<std::shared_ptr<const PreparedScene>> Prepare(const Scene& scene,
                                                                       Executor& executor);
   // Reads a blob; every offset and index is checked. kDataLoss says what and where. The blob is
@@ -88,7 +94,8 @@ class PreparedScene {
   float diagonal_m() const { return diagonal_m_; }  // of bounds(); 0 if there are no triangles
 
   std::span<const Vec3f> vertices() const { return vertices_; }  // relative to origin
-  std::span<const Vec3f> normals() const { return normals_; }    // unit; one per vertex
+  // One per vertex: unit, or zero where the object has none (has_normals == 0).
+  std::span<const Vec3f> normals() const { return normals_; }
   std::span<const Vec2f> uvs(unsigned set) const { return uv_[set]; }  // empty or one per vertex
   std::span<const PreparedTriangle> triangles() const { return triangles_; }
   std::span<const PreparedObject> objects() const { return objects_; }
@@ -98,6 +105,8 @@ class PreparedScene {
   const Rgb& sky() const { return sky_; }
   // Objects are two-sided; a scene is lit if it has a light with power, an emitter or a sky.
   bool has_alpha_masks() const { return has_alpha_masks_; }
+  // Triangles that Prepare left out because they are degenerate.
+  uint64_t dropped_triangles() const { return dropped_triangles_; }
   // Triangles whose material emits (emission > 0 in some channel), ascending.
   std::span<const uint32_t> emissive_triangles() const { return emissive_triangles_; }
 
@@ -112,11 +121,16 @@ class PreparedScene {
   // Interpolated and normalised, on the side of the geometric normal; the geometric normal where
   // the mesh has none.
   Vec3f ShadingNormal(uint32_t triangle, float b1, float b2) const;
+  // Textures are looked up bilinearly (or nearest where the file says so), in linear light, on
+  // their finest level.
   SurfaceSample Surface(uint32_t triangle, float b1, float b2) const;
   float Alpha(uint32_t triangle, float b1, float b2) const;
 
  private:
   PreparedScene() = default;
+  absl::Status Read();
+  absl::Status CheckTables() const;
+  absl::Status CheckGeometry();
   Rgb SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const;
 
   Blob blob_;
@@ -134,6 +148,7 @@ class PreparedScene {
   std::vector<uint32_t> emissive_triangles_;
   Rgb sky_;
   bool has_alpha_masks_ = false;
+  uint64_t dropped_triangles_ = 0;
 };
 
 }  // namespace farpoint

@@ -1,0 +1,26 @@
+// Encoded images to texels.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "core/base/status.h"
+
+namespace farpoint {
+
+inline constexpr uint32_t kMaxImageSide = 16384;
+
+struct DecodedImage {
+  uint32_t width = 0, height = 0;
+  std::vector<uint32_t> texels;  // rows from the top, RGBA8 with R in the lowest byte
+};
+
+// PNG and JPEG; 16-bit and grey images become RGBA8. kInvalidArgument names the image and says why
+// it cannot be read, or that it is larger than kMaxImageSide on a side or 2^27 texels. Memory is
+// bounded by the size that the image's header declares, whatever its data inflates to.
+absl::StatusOr<DecodedImage> DecodeImage(const std::string& name, std::span<const std::byte> bytes);
+
+}  // namespace farpoint

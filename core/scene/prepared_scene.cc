@@ -1,0 +1,882 @@
+#include "core/scene/prepared_scene.h"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <map>
+#include <optional>
+#include <utility>
+
+#include "core/base/byte_io.h"
+#include "core/math/elementary.h"
+#include "core/math/sampling.h"
+#include "core/scene/image_decode.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr uint64_t kMagic = 0x454e454353504600;  // "\0FPSCENE"
+constexpr uint32_t kVersion = 1;
+
+// Squares of lengths up to 2^62 are floats, and so are areas down to 2^-120.
+constexpr double kMaxExtentM = 0x1p60;
+constexpr double kMinExtentM = 0x1p-30;
+// A triangle is degenerate if its area is below this part of the scene's squared diagonal, or its
+// height below about this part of its longest edge.
+constexpr double kMinAreaRatio = 0x1p-60;
+constexpr double kMinSliverRatio = 0x1p-44;
+constexpr float kMaxRadiance = 1e15f;
+constexpr float kMaxUvFactor = 1e10f;
+constexpr uint64_t kMaxTexels = uint64_t{1} << 31;
+constexpr uint64_t kMaxElements = std::numeric_limits<uint32_t>::max();
+constexpr size_t kPiece = 1 << 14;
+
+static_assert(sizeof(PreparedTriangle) == 16 && sizeof(PreparedObject) == 32 &&
+              sizeof(PreparedMaterial) == 96 && sizeof(PreparedTexture) == 32 &&
+              sizeof(PreparedLight) == 56);
+
+// --- Looking up textures ---
+
+std::array<float, 256> MakeSrgbTable() {
+  std::array<float, 256> table{};
+  for (int i = 0; i < 256; ++i) table[i] = static_cast<float>(SrgbToLinear(i / 255.0));
+  return table;
+}
+const std::array<float, 256> kLinearFromSrgb8 = MakeSrgbTable();
+
+Rgb LinearColor(uint32_t texel) {
+  return {kLinearFromSrgb8[texel & 255], kLinearFromSrgb8[(texel >> 8) & 255],
+          kLinearFromSrgb8[(texel >> 16) & 255]};
+}
+float LinearAlpha(uint32_t texel) { return static_cast<float>(texel >> 24) * (1.0f / 255.0f); }
+
+// The two texels around a coordinate and the weight of the second.
+struct Tap {
+  uint32_t first, second;
+  float weight;
+};
+
+// `u` brought into the texture's period: [0, 1], or [0, 2] for mirrored repetition.
+float Wrap(float u, WrapMode mode) {
+  if (!(std::fabs(u) < 1e9f)) return 0.0f;
+  switch (mode) {
+    case WrapMode::kRepeat: return u - std::floor(u);
+    case WrapMode::kMirroredRepeat: return u - 2.0f * std::floor(0.5f * u);
+    default: return std::clamp(u, 0.0f, 1.0f);
+  }
+}
+
+// `i` in [-1, size], or [-1, 2 size] for mirrored repetition.
+uint32_t WrapTexel(int32_t i, int32_t size, WrapMode mode) {
+  switch (mode) {
+    case WrapMode::kRepeat:
+      if (i < 0) return static_cast<uint32_t>(size - 1);
+      return static_cast<uint32_t>(i >= size ? i - size : i);
+    case WrapMode::kMirroredRepeat:
+      if (i < 0 || i >= 2 * size) return 0;
+      return static_cast<uint32_t>(i >= size ? 2 * size - 1 - i : i);
+    default: return static_cast<uint32_t>(std::clamp(i, 0, size - 1));
+  }
+}
+
+Tap LinearTap(float u, uint32_t size, WrapMode mode) {
+  const float x = Wrap(u, mode) * static_cast<float>(size) - 0.5f;
+  const float floor_x = std::floor(x);
+  const auto i = static_cast<int32_t>(floor_x);
+  const auto n = static_cast<int32_t>(size);
+  return {WrapTexel(i, n, mode), WrapTexel(i + 1, n, mode), x - floor_x};
+}
+
+uint32_t NearestTexel(float u, uint32_t size, WrapMode mode) {
+  const float x = Wrap(u, mode) * static_cast<float>(size);
+  return WrapTexel(static_cast<int32_t>(x), static_cast<int32_t>(size), mode);
+}
+
+Vec2f TransformUv(const float (&m)[6], const Vec2f& uv) {
+  return {m[0] * uv.x + m[1] * uv.y + m[2], m[3] * uv.x + m[4] * uv.y + m[5]};
+}
+
+// --- Geometry ---
+
+Vec3d CrossOf(const Vec3f& a, const Vec3f& b, const Vec3f& c) {
+  return Cross(Vec3d(b) - Vec3d(a), Vec3d(c) - Vec3d(a));
+}
+
+bool IsDegenerate(const Vec3f& a, const Vec3f& b, const Vec3f& c, double min_area) {
+  const double edge2 = std::max({Length2(Vec3d(b) - Vec3d(a)), Length2(Vec3d(c) - Vec3d(a)),
+                                 Length2(Vec3d(c) - Vec3d(b))});
+  const double double_area = Length(CrossOf(a, b, c));
+  return !(double_area > kMinSliverRatio * edge2) || !(0.5 * double_area > min_area);
+}
+
+// 2^-k with k the exponent of the largest magnitude, so that x * result has largest in [1, 2).
+double InversePowerOfTwo(double largest) {
+  if (!(largest >= std::numeric_limits<double>::min()) || !std::isfinite(largest)) return 1.0;
+  const uint64_t exponent = std::bit_cast<uint64_t>(largest) >> 52;  // biased
+  // Exponents near the ends of the range have no exact inverse; nothing real comes near.
+  const uint64_t inverse = 2046 - std::min<uint64_t>(exponent, 2045);
+  return std::bit_cast<double>(inverse << 52);
+}
+
+uint64_t BitsOf(double x) { return std::bit_cast<uint64_t>(x + 0.0); }  // -0 as 0
+
+double LargestEntry(const Affine& m) {
+  return std::max({MaxAbs(m.column[0]), MaxAbs(m.column[1]), MaxAbs(m.column[2])});
+}
+
+// The linear part without its power of two, which no normal depends on.
+Affine NormalizedLinear(const Affine& m) {
+  const double scale = InversePowerOfTwo(LargestEntry(m));
+  Affine linear;
+  for (int c = 0; c < 3; ++c) linear.column[c] = m.column[c] * scale;
+  return linear;
+}
+
+uint64_t GeometryKey(const Mesh& mesh, const std::vector<bool>& used) {
+  float largest = 0;
+  for (size_t v = 0; v < mesh.positions.size(); ++v) {
+    if (used[v]) largest = std::max(largest, MaxAbs(mesh.positions[v]));
+  }
+  const double scale = InversePowerOfTwo(largest);
+  uint64_t key = HashKey(mesh.positions.size(), mesh.triangles.size());
+  for (size_t v = 0; v < mesh.positions.size(); ++v) {
+    if (!used[v]) continue;
+    const Vec3d p = Vec3d(mesh.positions[v]) * scale;
+    for (int c = 0; c < 3; ++c) key = Mix64(key ^ BitsOf(p[c]));
+  }
+  for (const auto& t : mesh.triangles) {
+    key = Mix64(key ^ (t[0] | uint64_t{t[1]} << 32));
+    key = Mix64(key ^ t[2]);
+  }
+  return key;
+}
+
+uint64_t ContentKey(uint64_t geometry_key, const Affine& world_from_mesh) {
+  const Affine linear = NormalizedLinear(world_from_mesh);
+  uint64_t key = geometry_key;
+  for (const Vec3d& column : linear.column) {
+    for (int c = 0; c < 3; ++c) key = HashKey(key, BitsOf(column[c]));
+  }
+  return key;
+}
+
+// --- Checks shared by Prepare and FromBlob ---
+
+bool InRange(const Rgb& c, float max) {
+  return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= max && c.y <= max && c.z <= max;
+}
+
+bool UsesTexture(const PreparedMaterial& m) {
+  return m.base_color_texture >= 0 || m.emission_texture >= 0;
+}
+
+absl::Status BadBlob(const std::string& text) {
+  return absl::DataLossError("prepared scene: " + text +
+                             "; the blob is damaged: remove it, so that it is fetched again");
+}
+
+// Builds the tables of a prepared scene.
+class Builder {
+ public:
+  Builder(const Scene& scene, Executor& executor) : scene_(scene), executor_(executor) {}
+
+  absl::StatusOr<Blob> Build() {
+    FP_RETURN_IF_ERROR(CheckReferences());
+    FP_RETURN_IF_ERROR(FindOrigin());
+    FP_RETURN_IF_ERROR(BuildMaterials());
+    for (size_t i = 0; i < scene_.instances.size(); ++i) FP_RETURN_IF_ERROR(Flatten(i));
+    FP_RETURN_IF_ERROR(BuildLights());
+    return Serialize();
+  }
+
+ private:
+  const Mesh& MeshOf(const Instance& instance) const { return scene_.meshes[instance.mesh]; }
+
+  std::string NameOf(const Mesh& mesh) const {
+    return "mesh " + std::to_string(&mesh - scene_.meshes.data()) + " ('" + mesh.name + "')";
+  }
+  std::string NameOf(const Instance& instance) const {
+    return "instance " + std::to_string(&instance - scene_.instances.data()) + " ('" +
+           instance.name + "') of " + NameOf(MeshOf(instance));
+  }
+
+  absl::Status CheckReferences() {
+    used_vertices_.resize(scene_.meshes.size());
+    for (const Mesh& mesh : scene_.meshes) {
+      const size_t count = mesh.positions.size();
+      const auto fail = [&](const std::string& text) {
+        return absl::InvalidArgumentError(NameOf(mesh) + ": " + text);
+      };
+      if (count > kMaxElements || mesh.triangles.size() > kMaxElements) {
+        return fail("has more than 2^32 vertices or triangles; split it");
+      }
+      if (!mesh.normals.empty() && mesh.normals.size() != count) {
+        return fail("has " + std::to_string(mesh.normals.size()) + " normals for " +
+                    std::to_string(count) + " positions; give each position one, or none");
+      }
+      for (const auto& uv : mesh.uv) {
+        if (!uv.empty() && uv.size() != count) {
+          return fail("has " + std::to_string(uv.size()) + " texture coordinates for " +
+                      std::to_string(count) + " positions; give each position one, or none");
+        }
+      }
+      if (mesh.material < -1 || mesh.material >= static_cast<int64_t>(scene_.materials.size())) {
+        return fail("material " + std::to_string(mesh.material) + " does not exist; there are " +
+                    std::to_string(scene_.materials.size()));
+      }
+      auto& used = used_vertices_[static_cast<size_t>(&mesh - scene_.meshes.data())];
+      used.assign(count, false);
+      for (size_t t = 0; t < mesh.triangles.size(); ++t) {
+        for (const uint32_t v : mesh.triangles[t]) {
+          if (v >= count) {
+            return fail("triangle " + std::to_string(t) + ": index " + std::to_string(v) +
+                        " is beyond the " + std::to_string(count) + " positions");
+          }
+          used[v] = true;
+        }
+      }
+    }
+    for (size_t i = 0; i < scene_.instances.size(); ++i) {
+      if (scene_.instances[i].mesh >= scene_.meshes.size()) {
+        return absl::InvalidArgumentError("instance " + std::to_string(i) + " ('" +
+                                          scene_.instances[i].name + "'): mesh " +
+                                          std::to_string(scene_.instances[i].mesh) +
+                                          " does not exist");
+      }
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status FindOrigin() {
+    Box3d bounds;
+    uint64_t vertices = 0, triangles = 0;
+    for (const Instance& instance : scene_.instances) {
+      const Mesh& mesh = MeshOf(instance);
+      const auto& used = used_vertices_[instance.mesh];
+      vertices += mesh.positions.size();
+      triangles += mesh.triangles.size();
+      if (vertices > kMaxElements || triangles > kMaxElements) {
+        return absl::ResourceExhaustedError(
+            NameOf(instance) + ": the scene has more than 2^32 vertices or triangles; simplify it");
+      }
+      for (size_t v = 0; v < mesh.positions.size(); ++v) {
+        if (!used[v]) continue;
+        const Vec3d p = instance.world_from_mesh.Point(Vec3d(mesh.positions[v]));
+        if (!IsFinite(p)) {
+          return absl::InvalidArgumentError(NameOf(instance) + ": vertex " + std::to_string(v) +
+                                            " is not finite in the world; correct the mesh or the "
+                                            "instance's transform");
+        }
+        bounds.Extend(p);
+      }
+    }
+    vertices_.reserve(vertices);
+    triangles_.reserve(triangles);
+    if (bounds.empty()) return absl::OkStatus();
+    origin_ = bounds.Center();
+    const double diagonal = bounds.Diagonal();
+    if (!(diagonal < kMaxExtentM)) {
+      return absl::InvalidArgumentError(
+          "the scene is more than 2^60 m across, beyond which squared distances overflow; scale it "
+          "down or remove what lies far away");
+    }
+    if (diagonal > 0 && diagonal < kMinExtentM) {
+      return absl::InvalidArgumentError(
+          "the scene is less than 2^-30 m across, below which areas lose their precision; scale it "
+          "up");
+    }
+    min_area_ = kMinAreaRatio * diagonal * diagonal;
+    return absl::OkStatus();
+  }
+
+  // --- Materials and textures, those that are used ---
+
+  absl::Status BuildMaterials() {
+    std::vector<bool> used(scene_.materials.size(), false);
+    bool uses_default = false;
+    for (const Instance& instance : scene_.instances) {
+      const Mesh& mesh = MeshOf(instance);
+      if (mesh.triangles.empty()) continue;
+      if (mesh.material < 0) uses_default = true;
+      else used[static_cast<size_t>(mesh.material)] = true;
+    }
+    prepared_material_.assign(scene_.materials.size(), 0);
+    prepared_texture_.assign(scene_.textures.size(), -1);
+    for (size_t m = 0; m < scene_.materials.size(); ++m) {
+      if (!used[m]) continue;
+      prepared_material_[m] = static_cast<uint32_t>(materials_.size());
+      FP_RETURN_IF_ERROR(AddMaterial(scene_.materials[m], m));
+    }
+    if (uses_default) {
+      default_material_ = static_cast<uint32_t>(materials_.size());
+      FP_RETURN_IF_ERROR(AddMaterial(Material(), scene_.materials.size()));
+    }
+    FP_RETURN_IF_ERROR(DecodeTextures());
+    for (PreparedMaterial& material : materials_) SimplifyMask(material);
+    return absl::OkStatus();
+  }
+
+  absl::Status AddMaterial(const Material& source, size_t index) {
+    const auto fail = [&](const std::string& text) {
+      return absl::InvalidArgumentError("material " + std::to_string(index) + " ('" + source.name +
+                                        "'): " + text);
+    };
+    PreparedMaterial m{};
+    if (!InRange(source.base_color, 1)) return fail("base colour outside of [0, 1]; clamp it");
+    if (!(source.base_alpha >= 0 && source.base_alpha <= 1)) {
+      return fail("alpha outside of [0, 1]; clamp it");
+    }
+    if (!InRange(source.emission, kMaxRadiance)) {
+      return fail("emission outside of [0, 1e15] W/(m² sr); lower it");
+    }
+    const bool mask = source.alpha_mode == AlphaMode::kMask;
+    if (mask && !(source.alpha_cutoff >= 0 && source.alpha_cutoff <= 1e6f)) {
+      return fail("alpha cut-off outside of [0, 1e6]; correct it");
+    }
+    m.base_color = source.base_color;
+    m.base_alpha = source.base_alpha;
+    m.alpha_cutoff = mask ? source.alpha_cutoff : -1.0f;
+    m.emission = source.emission;
+    m.base_color_texture = m.emission_texture = -1;
+    MakeUvMatrix({}, m.base_color_uv);
+    MakeUvMatrix({}, m.emission_uv);
+    // A texture that is multiplied by black is not looked up.
+    if (mask || MaxComponent(m.base_color) > 0) {
+      FP_RETURN_IF_ERROR(AddTexture(source.base_color_texture, fail, m.base_color_texture,
+                                    m.base_color_uv_set, m.base_color_uv));
+    }
+    if (MaxComponent(m.emission) > 0) {
+      FP_RETURN_IF_ERROR(AddTexture(source.emission_texture, fail, m.emission_texture,
+                                    m.emission_uv_set, m.emission_uv));
+    }
+    materials_.push_back(m);
+    return absl::OkStatus();
+  }
+
+  // Rows of uv' = offset + R(-rotation) scale uv. The extension's text and its conformance model
+  // (TextureTransformTest) turn the image clockwise for a positive rotation, v pointing down.
+  static void MakeUvMatrix(const UvTransform& t, float (&m)[6]) {
+    const SinCos r = DetSinCos(t.rotation_rad);
+    const auto s = static_cast<float>(r.sin);
+    const auto c = static_cast<float>(r.cos);
+    const float rows[6] = {c * t.scale.x,  s * t.scale.y, t.offset.x,
+                           -s * t.scale.x, c * t.scale.y, t.offset.y};
+    std::copy(rows, rows + 6, m);
+  }
+
+  template <typename Fail>
+  absl::Status AddTexture(const TextureRef& ref, const Fail& fail, int32_t& texture,
+                          uint32_t& uv_set, float (&uv_matrix)[6]) {
+    if (!ref.present()) return absl::OkStatus();
+    if (ref.texture >= static_cast<int64_t>(scene_.textures.size())) {
+      return fail("texture " + std::to_string(ref.texture) + " does not exist; there are " +
+                  std::to_string(scene_.textures.size()));
+    }
+    if (ref.uv_set > 1) return fail("texture coordinate set " + std::to_string(ref.uv_set) +
+                                    "; only 0 and 1 exist");
+    MakeUvMatrix(ref.transform, uv_matrix);
+    for (const float f : uv_matrix) {
+      if (!(std::fabs(f) <= kMaxUvFactor)) return fail("texture transform beyond 1e10; correct it");
+    }
+    int32_t& prepared = prepared_texture_[static_cast<size_t>(ref.texture)];
+    if (prepared < 0) {
+      prepared = static_cast<int32_t>(source_textures_.size());
+      source_textures_.push_back(static_cast<size_t>(ref.texture));
+    }
+    texture = prepared;
+    uv_set = ref.uv_set;
+    uses_uv_[uv_set] = true;
+    return absl::OkStatus();
+  }
+
+  absl::Status DecodeTextures() {
+    // Textures that differ only in their sampler share their texels.
+    std::map<const std::byte*, size_t> image_of_bytes;
+    std::vector<size_t> image_of_texture;
+    std::vector<const Texture*> images;
+    for (const size_t t : source_textures_) {
+      const Texture& source = scene_.textures[t];
+      const auto [it, is_new] = image_of_bytes.try_emplace(source.encoded.bytes().data(), images.size());
+      if (is_new) images.push_back(&source);
+      image_of_texture.push_back(it->second);
+    }
+    std::vector<absl::StatusOr<DecodedImage>> decoded(images.size(), absl::UnknownError(""));
+    executor_.ForEach(images.size(), 1, [&](size_t i) {
+      decoded[i] = DecodeImage(images[i]->name, images[i]->encoded.bytes());
+    });
+    std::vector<uint64_t> first_texel;
+    uint64_t total = 0;
+    for (const auto& image : decoded) {
+      if (!image.ok()) return image.status();
+      first_texel.push_back(total);
+      total += image->texels.size();
+    }
+    if (total > kMaxTexels) {
+      return absl::ResourceExhaustedError("the textures have " + std::to_string(total) +
+                                          " texels, more than 2^31; make them smaller");
+    }
+    texels_.reserve(total);
+    for (const auto& image : decoded) {
+      texels_.insert(texels_.end(), image->texels.begin(), image->texels.end());
+    }
+    for (size_t t = 0; t < source_textures_.size(); ++t) {
+      const Texture& source = scene_.textures[source_textures_[t]];
+      const size_t i = image_of_texture[t];
+      textures_.push_back({first_texel[i], decoded[i]->width, decoded[i]->height,
+                           static_cast<uint32_t>(source.wrap_s),
+                           static_cast<uint32_t>(source.wrap_t), source.nearest ? 1u : 0u, 0});
+    }
+    return absl::OkStatus();
+  }
+
+  // A mask without holes is opaque, and rays need not ask for its alpha.
+  void SimplifyMask(PreparedMaterial& material) const {
+    if (material.alpha_cutoff < 0) return;
+    uint32_t least = 255;
+    if (material.base_color_texture >= 0) {
+      const PreparedTexture& t = textures_[static_cast<size_t>(material.base_color_texture)];
+      const uint64_t count = uint64_t{t.width} * t.height;
+      for (uint64_t i = 0; i < count; ++i) least = std::min(least, texels_[t.first_texel + i] >> 24);
+    }
+    // The margin covers the rounding of the interpolation.
+    const float alpha = material.base_alpha * (static_cast<float>(least) / 255.0f);
+    if (alpha * (1.0f - 0x1p-16f) >= material.alpha_cutoff) material.alpha_cutoff = -1.0f;
+  }
+
+  // --- Geometry ---
+
+  absl::Status Flatten(size_t instance_index) {
+    const Instance& instance = scene_.instances[instance_index];
+    const Mesh& mesh = MeshOf(instance);
+    if (mesh.triangles.empty()) return absl::OkStatus();
+    const size_t first_vertex = vertices_.size();
+    const size_t first_triangle = triangles_.size();
+    AppendVertices(instance, mesh);
+    const bool mirrored = NormalizedLinear(instance.world_from_mesh).Determinant() < 0;
+    const auto object = static_cast<uint32_t>(objects_.size());
+    for (const auto& t : mesh.triangles) {
+      PreparedTriangle triangle{{static_cast<uint32_t>(first_vertex + t[0]),
+                                 static_cast<uint32_t>(first_vertex + t[mirrored ? 2 : 1]),
+                                 static_cast<uint32_t>(first_vertex + t[mirrored ? 1 : 2])},
+                                object};
+      const auto& v = triangle.vertex;
+      if (IsDegenerate(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]], min_area_)) {
+        ++dropped_;
+      } else {
+        triangles_.push_back(triangle);
+      }
+    }
+    if (triangles_.size() == first_triangle) {
+      vertices_.resize(first_vertex);
+      return absl::OkStatus();
+    }
+    AppendNormals(instance, mesh, first_vertex, first_triangle);
+    for (size_t set = 0; set < 2; ++set) {
+      if (uses_uv_[set]) AppendUvs(mesh, set, first_vertex);
+    }
+    uint64_t& geometry_key = geometry_keys_.try_emplace(instance.mesh, 0).first->second;
+    if (geometry_key == 0) geometry_key = GeometryKey(mesh, used_vertices_[instance.mesh]);
+    const uint32_t material = mesh.material < 0
+                                  ? default_material_
+                                  : prepared_material_[static_cast<size_t>(mesh.material)];
+    objects_.push_back({first_triangle, triangles_.size() - first_triangle, material,
+                        mesh.normals.empty() ? 0u : 1u,
+                        ContentKey(geometry_key, instance.world_from_mesh)});
+    return absl::OkStatus();
+  }
+
+  // Runs body(begin, end) over [0, count), in parallel where that is worth its while.
+  template <typename Body>
+  void ForPieces(size_t count, const Body& body) {
+    if (count <= kPiece) body(size_t{0}, count);
+    else executor_.ForEachPiece(count, kPiece, body);
+  }
+
+  void AppendVertices(const Instance& instance, const Mesh& mesh) {
+    const size_t first = vertices_.size();
+    vertices_.resize(first + mesh.positions.size());
+    const auto& used = used_vertices_[instance.mesh];
+    ForPieces(mesh.positions.size(), [&](size_t begin, size_t end) {
+      for (size_t v = begin; v < end; ++v) {
+        if (!used[v]) continue;
+        vertices_[first + v] =
+            Vec3f(instance.world_from_mesh.Point(Vec3d(mesh.positions[v])) - origin_);
+      }
+    });
+  }
+
+  void AppendNormals(const Instance& instance, const Mesh& mesh, size_t first_vertex,
+                     size_t first_triangle) {
+    normals_.resize(first_vertex + mesh.positions.size());
+    if (mesh.normals.empty()) return;
+    const Affine linear = NormalizedLinear(instance.world_from_mesh);
+    ForPieces(mesh.normals.size(), [&](size_t begin, size_t end) {
+      for (size_t v = begin; v < end; ++v) {
+        const Vec3d n(mesh.normals[v]);
+        // Normalised first: the cofactors of a tiny normal could vanish.
+        const Vec3d unit = IsFinite(n) ? NormalizeOr(n, Vec3d()) : Vec3d();
+        normals_[first_vertex + v] = Vec3f(NormalizeOr(linear.Normal(unit), Vec3d()));
+      }
+    });
+    // Made up where the file has none: the area-weighted mean of the triangles around the vertex.
+    std::map<uint32_t, Vec3d> missing;
+    for (size_t t = first_triangle; t < triangles_.size(); ++t) {
+      const auto& v = triangles_[t].vertex;
+      for (const uint32_t corner : v) {
+        if (normals_[corner] == Vec3f()) {
+          missing[corner] += CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]]);
+        }
+      }
+    }
+    if (missing.empty()) return;
+    for (size_t t = first_triangle; t < triangles_.size(); ++t) {
+      const auto& v = triangles_[t].vertex;
+      for (const uint32_t corner : v) {
+        if (normals_[corner] != Vec3f()) continue;
+        const Vec3d cross = CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]]);
+        normals_[corner] = Vec3f(NormalizeOr(missing[corner], NormalizeOr(cross, Vec3d(0, 1, 0))));
+      }
+    }
+  }
+
+  void AppendUvs(const Mesh& mesh, size_t set, size_t first_vertex) {
+    uv_[set].resize(first_vertex + mesh.positions.size());
+    for (size_t v = 0; v < mesh.uv[set].size(); ++v) {
+      const Vec2f& uv = mesh.uv[set][v];
+      if (std::isfinite(uv.x) && std::isfinite(uv.y)) uv_[set][first_vertex + v] = uv;
+    }
+  }
+
+  // --- Lights ---
+
+  absl::Status BuildLights() {
+    if (!InRange(scene_.environment.sky, kMaxRadiance)) {
+      return absl::InvalidArgumentError("the sky's radiance is outside of [0, 1e15]; correct it");
+    }
+    for (size_t l = 0; l < scene_.lights.size(); ++l) {
+      const PunctualLight& source = scene_.lights[l];
+      const auto fail = [&](const std::string& text) {
+        return absl::InvalidArgumentError("light " + std::to_string(l) + " ('" + source.name +
+                                          "'): " + text);
+      };
+      PreparedLight light{};
+      light.kind = static_cast<uint32_t>(source.kind);
+      light.intensity = source.intensity;
+      if (!InRange(source.intensity, 1e30f)) {
+        return fail("intensity outside of [0, 1e30]; correct it");
+      }
+      if (source.kind != PunctualKind::kDirectional) {
+        const Vec3d offset = source.position - origin_;
+        if (!IsFinite(offset) || MaxAbs(offset) > kMaxExtentM) {
+          return fail("is more than 2^60 m away from the scene; move it closer");
+        }
+        light.position = Vec3f(offset);
+      }
+      if (source.kind != PunctualKind::kPoint) {
+        const Vec3d direction =
+            IsFinite(source.direction) ? NormalizeOr(source.direction, Vec3d()) : Vec3d();
+        if (direction == Vec3d()) return fail("has no direction; give it one");
+        light.direction = Vec3f(direction);
+      }
+      if (!(source.range_m >= 0)) return fail("its range is negative; correct it");
+      // A range beyond all that the scene can hold is infinite.
+      light.range_m = source.range_m > kMaxExtentM ? 0.0f : static_cast<float>(source.range_m);
+      if (source.kind == PunctualKind::kSpot) {
+        if (!(source.inner_cone_rad >= 0 && source.inner_cone_rad <= source.outer_cone_rad &&
+              source.outer_cone_rad <= 0.5 * kPi + 1e-6)) {
+          return fail("cone angles must be 0 <= inner <= outer <= pi/2; correct them");
+        }
+        light.cos_inner = static_cast<float>(DetSinCos(source.inner_cone_rad).cos);
+        light.cos_outer = static_cast<float>(DetSinCos(source.outer_cone_rad).cos);
+      } else {
+        light.cos_inner = 1;
+        light.cos_outer = -1;
+      }
+      lights_.push_back(light);
+    }
+    return absl::OkStatus();
+  }
+
+  Blob Serialize() {
+    ByteWriter w;
+    w.Put(kMagic);
+    w.Put(kVersion);
+    w.Put(uint32_t{0});
+    w.Put(origin_);
+    w.Put(scene_.environment.sky);
+    w.Put(dropped_);
+    w.PutArray(std::span<const Vec3f>(vertices_));
+    w.PutArray(std::span<const Vec3f>(normals_));
+    for (const auto& uv : uv_) w.PutArray(std::span<const Vec2f>(uv));
+    w.PutArray(std::span<const PreparedTriangle>(triangles_));
+    w.PutArray(std::span<const PreparedObject>(objects_));
+    w.PutArray(std::span<const PreparedMaterial>(materials_));
+    w.PutArray(std::span<const PreparedTexture>(textures_));
+    w.PutArray(std::span<const PreparedLight>(lights_));
+    w.PutArray(std::span<const uint32_t>(texels_));
+    return Blob::FromVector(w.Take());
+  }
+
+  const Scene& scene_;
+  Executor& executor_;
+  std::vector<std::vector<bool>> used_vertices_;  // by mesh
+  std::map<uint32_t, uint64_t> geometry_keys_;    // by mesh
+  Vec3d origin_;
+  double min_area_ = 0;
+  std::vector<uint32_t> prepared_material_;  // by scene material
+  std::vector<int32_t> prepared_texture_;    // by scene texture; -1: unused
+  std::vector<size_t> source_textures_;      // by prepared texture
+  uint32_t default_material_ = 0;
+  std::array<bool, 2> uses_uv_{};
+  uint64_t dropped_ = 0;
+  std::vector<Vec3f> vertices_, normals_;
+  std::array<std::vector<Vec2f>, 2> uv_;
+  std::vector<PreparedTriangle> triangles_;
+  std::vector<PreparedObject> objects_;
+  std::vector<PreparedMaterial> materials_;
+  std::vector<PreparedTexture> textures_;
+  std::vector<uint32_t> texels_;
+  std::vector<PreparedLight> lights_;
+};
+
+}  // namespace
+
+absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Prepare(const Scene& scene,
+                                                                            Executor& executor) {
+  FP_ASSIGN_OR_RETURN(Blob blob, Builder(scene, executor).Build());
+  return FromBlob(std::move(blob));
+}
+
+absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::FromBlob(Blob blob) {
+  std::shared_ptr<PreparedScene> scene(new PreparedScene());
+  scene->blob_ = std::move(blob);
+  if (const absl::Status status = scene->Read(); !status.ok()) {
+    return Annotate(status, "prepared scene");
+  }
+  FP_RETURN_IF_ERROR(scene->CheckTables());
+  FP_RETURN_IF_ERROR(scene->CheckGeometry());
+  return std::shared_ptr<const PreparedScene>(std::move(scene));
+}
+
+absl::Status PreparedScene::Read() {
+  ByteReader r(blob_.bytes());
+  uint64_t magic = 0;
+  uint32_t version = 0, reserved = 0;
+  FP_RETURN_IF_ERROR(r.Get(magic, "magic"));
+  if (magic != kMagic) return absl::DataLossError("byte 0: this is not a prepared scene");
+  FP_RETURN_IF_ERROR(r.Get(version, "version"));
+  if (version != kVersion) {
+    return absl::FailedPreconditionError(
+        "byte 8: has format version " + std::to_string(version) + ", this program reads " +
+        std::to_string(kVersion) + "; run the same farpoint version everywhere");
+  }
+  FP_RETURN_IF_ERROR(r.Get(reserved, "reserved"));
+  FP_RETURN_IF_ERROR(r.Get(origin_, "origin"));
+  FP_RETURN_IF_ERROR(r.Get(sky_, "sky"));
+  FP_RETURN_IF_ERROR(r.Get(dropped_triangles_, "dropped_triangles"));
+  FP_RETURN_IF_ERROR(r.GetArray(vertices_, "vertices"));
+  FP_RETURN_IF_ERROR(r.GetArray(normals_, "normals"));
+  FP_RETURN_IF_ERROR(r.GetArray(uv_[0], "uv0"));
+  FP_RETURN_IF_ERROR(r.GetArray(uv_[1], "uv1"));
+  FP_RETURN_IF_ERROR(r.GetArray(triangles_, "triangles"));
+  FP_RETURN_IF_ERROR(r.GetArray(objects_, "objects"));
+  FP_RETURN_IF_ERROR(r.GetArray(materials_, "materials"));
+  FP_RETURN_IF_ERROR(r.GetArray(textures_, "textures"));
+  FP_RETURN_IF_ERROR(r.GetArray(lights_, "lights"));
+  FP_RETURN_IF_ERROR(r.GetArray(texels_, "texels"));
+  return r.ExpectEnd();
+}
+
+absl::Status PreparedScene::CheckTables() const {
+  if (!IsFinite(origin_)) return BadBlob("the origin is not finite");
+  if (!InRange(sky_, kMaxRadiance)) return BadBlob("the sky's radiance is out of range");
+  if (normals_.size() != vertices_.size() || vertices_.size() > kMaxElements ||
+      triangles_.size() > kMaxElements) {
+    return BadBlob("the numbers of vertices, normals and triangles do not fit");
+  }
+  for (const auto& uv : uv_) {
+    if (!uv.empty() && uv.size() != vertices_.size()) {
+      return BadBlob("the numbers of vertices and texture coordinates do not fit");
+    }
+  }
+  for (size_t t = 0; t < textures_.size(); ++t) {
+    const PreparedTexture& texture = textures_[t];
+    const std::string name = "texture " + std::to_string(t);
+    if (texture.width == 0 || texture.height == 0 || texture.width > kMaxImageSide ||
+        texture.height > kMaxImageSide || texture.wrap_s > 2 || texture.wrap_t > 2 ||
+        texture.nearest > 1) {
+      return BadBlob(name + " has a value out of range");
+    }
+    const uint64_t count = uint64_t{texture.width} * texture.height;
+    if (texture.first_texel > texels_.size() || count > texels_.size() - texture.first_texel) {
+      return BadBlob(name + " reaches beyond the texels");
+    }
+  }
+  for (size_t m = 0; m < materials_.size(); ++m) {
+    const PreparedMaterial& material = materials_[m];
+    bool good = InRange(material.base_color, 1) && InRange(material.emission, kMaxRadiance) &&
+                material.base_alpha >= 0 && material.base_alpha <= 1 &&
+                material.alpha_cutoff >= -1 && material.alpha_cutoff <= 1e6f;
+    for (int i = 0; i < 6; ++i) {
+      good = good && std::fabs(material.base_color_uv[i]) <= kMaxUvFactor &&
+             std::fabs(material.emission_uv[i]) <= kMaxUvFactor;
+    }
+    const auto texture_is_good = [&](int32_t texture, uint32_t uv_set) {
+      if (texture == -1) return uv_set <= 1;
+      return texture >= 0 && static_cast<size_t>(texture) < textures_.size() && uv_set <= 1 &&
+             uv_[uv_set].size() == vertices_.size();
+    };
+    good = good && texture_is_good(material.base_color_texture, material.base_color_uv_set) &&
+           texture_is_good(material.emission_texture, material.emission_uv_set);
+    if (!good) return BadBlob("material " + std::to_string(m) + " has a value out of range");
+  }
+  for (size_t l = 0; l < lights_.size(); ++l) {
+    const PreparedLight& light = lights_[l];
+    const bool directed = light.kind != static_cast<uint32_t>(PunctualKind::kPoint);
+    const bool good = light.kind <= 2 && InRange(light.intensity, 1e30f) &&
+                      IsFinite(light.position) && MaxAbs(light.position) <= kMaxExtentM &&
+                      IsFinite(light.direction) &&
+                      (!directed || std::fabs(Length2(light.direction) - 1.0f) < 1e-3f) &&
+                      light.range_m >= 0 && light.range_m <= kMaxExtentM && light.cos_inner <= 1 &&
+                      light.cos_outer >= -1 && light.cos_outer <= light.cos_inner;
+    if (!good) return BadBlob("light " + std::to_string(l) + " has a value out of range");
+  }
+  return absl::OkStatus();
+}
+
+absl::Status PreparedScene::CheckGeometry() {
+  for (size_t v = 0; v < vertices_.size(); ++v) {
+    if (!IsFinite(vertices_[v]) || !(MaxAbs(vertices_[v]) <= kMaxExtentM)) {
+      return BadBlob("vertex " + std::to_string(v) + " is out of range");
+    }
+  }
+  for (const auto& uv : uv_) {
+    for (size_t v = 0; v < uv.size(); ++v) {
+      if (!std::isfinite(uv[v].x) || !std::isfinite(uv[v].y)) {
+        return BadBlob("texture coordinate " + std::to_string(v) + " is not finite");
+      }
+    }
+  }
+  uint64_t next = 0;
+  for (size_t o = 0; o < objects_.size(); ++o) {
+    const PreparedObject& object = objects_[o];
+    const std::string name = "object " + std::to_string(o);
+    if (object.first_triangle != next || object.triangle_count == 0 ||
+        object.triangle_count > triangles_.size() - next || object.material >= materials_.size() ||
+        object.has_normals > 1) {
+      return BadBlob(name + " has a value out of range");
+    }
+    next += object.triangle_count;
+    const PreparedMaterial& material = materials_[object.material];
+    const bool emits = MaxComponent(material.emission) > 0;
+    has_alpha_masks_ = has_alpha_masks_ || material.alpha_cutoff >= 0;
+    for (uint64_t t = object.first_triangle; t < next; ++t) {
+      const PreparedTriangle& triangle = triangles_[t];
+      bool good = triangle.object == o;
+      for (const uint32_t v : triangle.vertex) {
+        good = good && v < vertices_.size();
+        if (!good) break;
+        // Written so that NaN fails.
+        good = object.has_normals == 0 || std::fabs(Length2(normals_[v]) - 1.0f) < 1e-3f;
+        bounds_.Extend(vertices_[v]);
+      }
+      good = good && !IsDegenerate(vertices_[triangle.vertex[0]], vertices_[triangle.vertex[1]],
+                                   vertices_[triangle.vertex[2]],
+                                   std::numeric_limits<float>::min());
+      if (!good) return BadBlob("triangle " + std::to_string(t) + " has a value out of range");
+      if (emits) emissive_triangles_.push_back(static_cast<uint32_t>(t));
+    }
+  }
+  if (next != triangles_.size()) return BadBlob("triangles belong to no object");
+  diagonal_m_ = bounds_.Diagonal();
+  return absl::OkStatus();
+}
+
+Vec3f PreparedScene::GeometricNormal(uint32_t triangle) const {
+  const auto& v = triangles_[triangle].vertex;
+  const Vec3d cross = CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]]);
+  return Vec3f(NormalizeOr(cross, Vec3d(0, 1, 0)));
+}
+
+float PreparedScene::TriangleArea(uint32_t triangle) const {
+  const auto& v = triangles_[triangle].vertex;
+  return static_cast<float>(
+      0.5 * Length(CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]])));
+}
+
+Vec3f PreparedScene::PointOn(uint32_t triangle, float b1, float b2) const {
+  const auto& v = triangles_[triangle].vertex;
+  const Vec3f& a = vertices_[v[0]];
+  return a + (vertices_[v[1]] - a) * b1 + (vertices_[v[2]] - a) * b2;
+}
+
+Vec3f PreparedScene::ShadingNormal(uint32_t triangle, float b1, float b2) const {
+  const PreparedTriangle& t = triangles_[triangle];
+  const Vec3f n_geometric = GeometricNormal(triangle);
+  if (objects_[t.object].has_normals == 0) return n_geometric;
+  const Vec3f sum = normals_[t.vertex[0]] * (1.0f - b1 - b2) + normals_[t.vertex[1]] * b1 +
+                    normals_[t.vertex[2]] * b2;
+  const Vec3f n = NormalizeOr(sum, n_geometric);
+  return Dot(n, n_geometric) < 0 ? -n : n;
+}
+
+Rgb PreparedScene::SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const {
+  const PreparedTexture& t = textures_[static_cast<size_t>(texture)];
+  const uint32_t* texels = texels_.data() + t.first_texel;
+  const auto wrap_s = static_cast<WrapMode>(t.wrap_s);
+  const auto wrap_t = static_cast<WrapMode>(t.wrap_t);
+  if (t.nearest != 0) {
+    const uint32_t texel = texels[size_t{NearestTexel(uv.y, t.height, wrap_t)} * t.width +
+                                  NearestTexel(uv.x, t.width, wrap_s)];
+    if (alpha != nullptr) *alpha = LinearAlpha(texel);
+    return LinearColor(texel);
+  }
+  const Tap x = LinearTap(uv.x, t.width, wrap_s);
+  const Tap y = LinearTap(uv.y, t.height, wrap_t);
+  const uint32_t* upper = texels + size_t{y.first} * t.width;
+  const uint32_t* lower = texels + size_t{y.second} * t.width;
+  const uint32_t texel[4] = {upper[x.first], upper[x.second], lower[x.first], lower[x.second]};
+  const float weight[4] = {(1.0f - x.weight) * (1.0f - y.weight), x.weight * (1.0f - y.weight),
+                           (1.0f - x.weight) * y.weight, x.weight * y.weight};
+  if (alpha != nullptr) {
+    *alpha = LinearAlpha(texel[0]) * weight[0] + LinearAlpha(texel[1]) * weight[1] +
+             LinearAlpha(texel[2]) * weight[2] + LinearAlpha(texel[3]) * weight[3];
+  }
+  return LinearColor(texel[0]) * weight[0] + LinearColor(texel[1]) * weight[1] +
+         LinearColor(texel[2]) * weight[2] + LinearColor(texel[3]) * weight[3];
+}
+
+SurfaceSample PreparedScene::Surface(uint32_t triangle, float b1, float b2) const {
+  const PreparedTriangle& t = triangles_[triangle];
+  const PreparedMaterial& m = materials_[objects_[t.object].material];
+  SurfaceSample sample{m.base_color, m.emission, m.alpha_cutoff < 0 ? 1.0f : m.base_alpha};
+  if (!UsesTexture(m)) return sample;
+  const auto uv_at = [&](uint32_t set) -> Vec2f {
+    const auto& uv = uv_[set];
+    const Vec2f &a = uv[t.vertex[0]], &b = uv[t.vertex[1]], &c = uv[t.vertex[2]];
+    return {a.x + (b.x - a.x) * b1 + (c.x - a.x) * b2, a.y + (b.y - a.y) * b1 + (c.y - a.y) * b2};
+  };
+  if (m.base_color_texture >= 0) {
+    float alpha = 1;
+    const Vec2f uv = TransformUv(m.base_color_uv, uv_at(m.base_color_uv_set));
+    const Rgb color = SampleTexture(m.base_color_texture, uv, &alpha);
+    // Weights may sum to a rounding error above one.
+    sample.albedo = Min(m.base_color * color, Rgb(1));
+    if (m.alpha_cutoff >= 0) sample.alpha = std::min(m.base_alpha * alpha, 1.0f);
+  }
+  if (m.emission_texture >= 0) {
+    const Vec2f uv = TransformUv(m.emission_uv, uv_at(m.emission_uv_set));
+    sample.emission = m.emission * SampleTexture(m.emission_texture, uv, nullptr);
+  }
+  return sample;
+}
+
+float PreparedScene::Alpha(uint32_t triangle, float b1, float b2) const {
+  if (MaterialOf(triangle).alpha_cutoff < 0) return 1.0f;
+  return Surface(triangle, b1, b2).alpha;
+}
+
+}  // namespace farpoint
