@@ -42,20 +42,17 @@ absl::StatusOr<size_t> OpenForReading(const std::string& path, Descriptor& file)
 
 }  // namespace
 
-Blob Blob::FromVector(std::vector<std::byte> bytes) {
-  auto owner = std::make_shared<const std::vector<std::byte>>(std::move(bytes));
+Blob Blob::FromAligned(AlignedVector<std::byte> bytes) {
+  auto owner = std::make_shared<const AlignedVector<std::byte>>(std::move(bytes));
   Blob blob;
   blob.bytes_ = *owner;
   blob.owner_ = std::move(owner);
   return blob;
 }
 
-Blob Blob::FromString(std::string bytes) {
-  auto owner = std::make_shared<const std::string>(std::move(bytes));
-  Blob blob;
-  blob.bytes_ = std::as_bytes(std::span(owner->data(), owner->size()));
-  blob.owner_ = std::move(owner);
-  return blob;
+Blob Blob::FromString(std::string_view bytes) {
+  const auto view = std::as_bytes(std::span(bytes.data(), bytes.size()));
+  return FromAligned(AlignedVector<std::byte>(view.begin(), view.end()));
 }
 
 absl::StatusOr<Blob> Blob::MapFile(const std::string& path) {
@@ -116,7 +113,7 @@ absl::StatusOr<Blob> ReadFile(const std::string& path, size_t max_bytes) {
                                         " bytes, more than the " + std::to_string(max_bytes) +
                                         " that are accepted");
   }
-  std::vector<std::byte> bytes(size);
+  AlignedVector<std::byte> bytes(size);
   size_t done = 0;
   while (done < size) {
     const ssize_t n = ::read(file.fd, bytes.data() + done, size - done);
@@ -125,7 +122,7 @@ absl::StatusOr<Blob> ReadFile(const std::string& path, size_t max_bytes) {
     if (n == 0) return absl::UnavailableError("'" + path + "' became shorter while it was read");
     done += static_cast<size_t>(n);
   }
-  return Blob::FromVector(std::move(bytes));
+  return Blob::FromAligned(std::move(bytes));
 }
 
 }  // namespace farpoint

@@ -6,8 +6,10 @@
 #include <memory>
 #include <span>
 #include <string>
+#include <string_view>
 #include <vector>
 
+#include "core/base/aligned.h"
 #include "core/base/hash.h"
 #include "core/base/status.h"
 
@@ -18,8 +20,11 @@ class Blob {
   // Empty.
   Blob() = default;
 
-  static Blob FromVector(std::vector<std::byte> bytes);
-  static Blob FromString(std::string bytes);
+  static Blob FromAligned(AlignedVector<std::byte> bytes);  // no copy
+  static Blob FromVector(const std::vector<std::byte>& bytes) {
+    return FromAligned(AlignedVector<std::byte>(bytes.begin(), bytes.end()));
+  }
+  static Blob FromString(std::string_view bytes);
   // Maps the file read-only. kNotFound, kPermissionDenied or kUnavailable, naming the path.
   // Who truncates a mapped file kills its readers: cache files are replaced by rename only.
   static absl::StatusOr<Blob> MapFile(const std::string& path);
@@ -30,7 +35,7 @@ class Blob {
 
  private:
   std::shared_ptr<const void> owner_;
-  std::span<const std::byte> bytes_;  // 16-byte aligned unless empty
+  std::span<const std::byte> bytes_;  // at a multiple of kBlobAlignment
 };
 
 // Writes `path`.part, flushes it to the disk and renames it, so that `path` is whole or absent.

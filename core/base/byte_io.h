@@ -12,14 +12,16 @@
 #include <type_traits>
 #include <vector>
 
+#include "core/base/aligned.h"
+#include "core/base/blob.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
 static_assert(std::endian::native == std::endian::little, "byte formats are little-endian");
 
-// Appends to a growing buffer. Arrays start at multiples of 16 bytes, so that a mapped blob can be
-// viewed in place.
+// Appends to a growing buffer. Arrays start at multiples of kBlobAlignment, so that a mapped blob
+// can be viewed in place.
 class ByteWriter {
  public:
   template <typename T>
@@ -35,21 +37,24 @@ class ByteWriter {
     bytes_.resize(at + text.size());
     if (!text.empty()) std::memcpy(bytes_.data() + at, text.data(), text.size());
   }
-  // u64 count, zero bytes up to a multiple of 16, then the elements.
+  // u64 count, zero bytes up to a multiple of kBlobAlignment, then the elements.
   template <typename T>
     requires std::is_trivially_copyable_v<T>
   void PutArray(std::span<const T> values) {
     Put<uint64_t>(values.size());
-    bytes_.resize((bytes_.size() + 15) / 16 * 16);
+    bytes_.resize((bytes_.size() + kBlobAlignment - 1) / kBlobAlignment * kBlobAlignment);
     const size_t at = bytes_.size();
     bytes_.resize(at + values.size_bytes());
     if (!values.empty()) std::memcpy(bytes_.data() + at, values.data(), values.size_bytes());
   }
   size_t size() const { return bytes_.size(); }
-  std::vector<std::byte> Take() { return std::move(bytes_); }
+  // A copy, for small records.
+  std::vector<std::byte> Take() const { return {bytes_.begin(), bytes_.end()}; }
+  // Moves the bytes out without a copy.
+  Blob TakeBlob() { return Blob::FromAligned(std::move(bytes_)); }
 
  private:
-  std::vector<std::byte> bytes_;
+  AlignedVector<std::byte> bytes_;
 };
 
 // Reads what ByteWriter wrote. Every read is checked against what is left: kDataLoss names the
@@ -74,15 +79,19 @@ class ByteReader {
     at_ += size;
     return absl::OkStatus();
   }
-  // The view points into the blob. The blob must be 16-byte aligned (Blob is).
+  // The view points into the blob. The bytes must start at a multiple of
+  // kBlobAlignment (a Blob does); kDataLoss otherwise if T asks for more than 16.
   template <typename T>
     requires std::is_trivially_copyable_v<T>
   absl::Status GetArray(std::span<const T>& values, std::string_view field) {
     uint64_t count = 0;
     FP_RETURN_IF_ERROR(Get(count, field));
-    const size_t aligned = (at_ + 15) / 16 * 16;
+    const size_t aligned = (at_ + kBlobAlignment - 1) / kBlobAlignment * kBlobAlignment;
     if (aligned > bytes_.size() || count > (bytes_.size() - aligned) / sizeof(T)) {
       return Short(field);
+    }
+    if (reinterpret_cast<uintptr_t>(bytes_.data()) % alignof(T) != 0) {
+      return absl::DataLossError("field '" + std::string(field) + "' is not aligned in memory");
     }
     values = {reinterpret_cast<const T*>(bytes_.data() + aligned), static_cast<size_t>(count)};
     at_ = aligned + static_cast<size_t>(count) * sizeof(T);

@@ -198,11 +198,9 @@ class Rasterizer {
 }  // namespace
 
 Microbuffer::Microbuffer(const MicrobufferMap& map)
-    : map_(&map), storage_(5 * size_t{map.padded()} + 8) {
-  // 32-byte alignment for SIMD loads.
-  auto address = reinterpret_cast<uintptr_t>(storage_.data());
-  float* base = storage_.data() + ((32 - address % 32) % 32) / sizeof(float);
-  for (int i = 0; i < 5; ++i) values_[i] = base + i * size_t{map.padded()};
+    : map_(&map), storage_(5 * size_t{map.padded()}) {
+  // padded() is a multiple of 8 floats, so every plane is aligned for SIMD.
+  for (int i = 0; i < 5; ++i) values_[i] = storage_.data() + i * size_t{map.padded()};
   touched_ = 1;
   Clear();
 }

@@ -12,6 +12,7 @@
 #include <span>
 #include <vector>
 
+#include "core/base/aligned.h"
 #include "core/math/vec.h"
 #include "core/pbgi/gather_params.h"
 #include "core/pbgi/microbuffer_map.h"
@@ -43,7 +44,7 @@ class Microbuffer {
 
  private:
   const MicrobufferMap* map_;
-  std::vector<float> storage_;
+  AlignedVector<float> storage_;
   float* values_[5];
   uint64_t touched_ = 0;
 };

@@ -18,6 +18,7 @@
 #include <memory>
 #include <vector>
 
+#include "core/base/aligned.h"
 #include "core/math/vec.h"
 #include "core/pbgi/gather_params.h"
 
@@ -65,22 +66,11 @@ class MicrobufferMap {
   float reference_solid_angle() const { return reference_solid_angle_; }
 
  private:
-  template <typename T>
-  struct AlignedAllocator {
-    using value_type = T;
-    T* allocate(size_t n) {
-      return static_cast<T*>(::operator new(n * sizeof(T), std::align_val_t(32)));
-    }
-    void deallocate(T* p, size_t) { ::operator delete(p, std::align_val_t(32)); }
-    bool operator==(const AlignedAllocator&) const { return true; }
-  };
-  using Array = std::vector<float, AlignedAllocator<float>>;
-
   BufferMap kind_;
   uint32_t side_, padded_;
   float reference_solid_angle_;
-  std::array<Array, 3> dir_, weight_;
-  Array solid_angle_;
+  std::array<AlignedVector<float>, 3> dir_, weight_;
+  AlignedVector<float> solid_angle_;
 };
 
 }  // namespace farpoint

@@ -280,14 +280,14 @@ PointTree::Blobs PointTree::Build(const SurfelCloud& cloud, const SurfelShading&
   topology.Put<uint64_t>(n);
   topology.PutArray(std::span<const NodeGroup>(nodes));
   Blobs blobs;
-  blobs.topology = Blob::FromVector(topology.Take());
+  blobs.topology = topology.TakeBlob();
   nodes = {};
   ByteWriter light;
   light.Put(kRadianceMagic);
   light.Put(kVersion);
   light.Put<uint64_t>(n);
   light.PutArray(std::span<const RadianceGroup>(radiance));
-  blobs.radiance = Blob::FromVector(light.Take());
+  blobs.radiance = light.TakeBlob();
   return blobs;
 }
 

@@ -29,12 +29,12 @@ struct ClusterParams {
 
 struct ReceiverCluster {
   std::vector<uint32_t> members;  // indices of receivers, ascending, not empty
-  uint32_t active;                // the member nearest to the centre under D
+  uint32_t active = 0;             // the member nearest to the centre under D
   Vec3f mean_normal;              // unit
-  float radius_m;                 // R_c: largest distance of a member from the active receiver
-  float sin_spread, cos_spread;   // of the largest angle between a member's normal and the mean
-  float margin_m;                 // see CutView::margin_m
-  bool sees_inside;               // any member is on_back
+  float radius_m = 0;              // R_c: largest distance of a member from the active receiver
+  float sin_spread = 0, cos_spread = 1;   // of the largest angle between a member's normal and the mean
+  float margin_m = 0;                 // see CutView::margin_m
+  bool sees_inside = false;               // any member is on_back
 };
 
 // D(x, c) = |p_c - p_x|² + α |n_c - n_x|² (§3.1).

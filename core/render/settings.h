@@ -22,7 +22,7 @@ struct RenderSettings {
   Integrator integrator = Integrator::kFpbgi;
   uint32_t spp = 1;             // receivers per pixel, 1..256; 1: the pixel's centre
   uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
-  uint32_t light_samples = 16;  // shadow rays per receiver or surfel and light, 1..4096
+  uint32_t light_samples = 32;  // shadow rays per receiver or surfel and light, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
   uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default
   BufferMap buffer_map = BufferMap::kOctahedral;

@@ -617,7 +617,7 @@ class Builder {
     w.PutArray(std::span<const PreparedTexture>(textures_));
     w.PutArray(std::span<const PreparedLight>(lights_));
     w.PutArray(std::span<const uint32_t>(texels_));
-    return Blob::FromVector(w.Take());
+    return w.TakeBlob();
   }
 
   const Scene& scene_;
