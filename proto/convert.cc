@@ -505,6 +505,8 @@ absl::StatusOr<Camera> CameraFromWire(const v1::Camera& wire, std::string_view f
   if (!(camera.yfov_rad > 0) || !(camera.yfov_rad < 3.14159265358979)) {
     return Bad(Path(field, "yfov_rad"), Text(camera.yfov_rad), "more than 0, less than pi");
   }
+  FP_RETURN_IF_ERROR(CheckLength(wire.name(), kMaxUriBytes, Path(field, "name")));
+  camera.name = wire.name();
   return camera;
 }
 v1::Camera ToWire(const Camera& camera) {
@@ -514,6 +516,7 @@ v1::Camera ToWire(const Camera& camera) {
   VecToWire(camera.up, wire.mutable_up());
   VecToWire(camera.forward, wire.mutable_forward());
   wire.set_yfov_rad(camera.yfov_rad);
+  wire.set_name(camera.name);
   return wire;
 }
 

@@ -9,15 +9,16 @@
 //   InProcessLink<CoordinatorApi> link(*coordinator); // worker/in_process_link.h
 //   WorkerOptions worker_options;                     // threads, name; see worker/worker.h
 //   worker_options.fingerprint = …                    // any fixed digest will do in one process
-//   Worker worker(worker_options, link, link, *MakeCoreRenderer());   // worker/tile_renderer.h
+//   auto renderer = MakeCoreRenderer();               // worker/tile_renderer.h
+//   Worker worker(worker_options, link, link, *renderer);
 //   std::thread thread([&] { worker.Run(); });        // until worker.Stop()
 //   for (auto& [uri, blob] : asset.files) coordinator->PutBlob(blob.Hash(), blob);
 //   FP_ASSIGN_OR_RETURN(JobId job, coordinator->Submit(spec, /*submission_id=*/""));
 //   for (uint64_t after = 0;;) {                      // until a final JobState event
 //     FP_ASSIGN_OR_RETURN(auto events, coordinator->NextEvents(job, after, 200ms));
 //     for (const JobEvent& e : events) {
-//       if (e.sequence != 0) after = e.sequence;      // TileCommitted: FetchTile, DecodeFilm,
-//       Paste
+//       if (e.sequence != 0) after = e.sequence;
+//       …                                             // TileCommitted: FetchTile, DecodeFilm
 //     }
 //   }
 //   worker.Stop(); thread.join();                     // before the coordinator is destroyed
@@ -43,20 +44,11 @@
 #include "core/base/hash.h"
 #include "core/base/status.h"
 #include "proto/job.h"
+#include "server/blob_writer.h"
 
 namespace farpoint {
 
 class SceneBaker;  // server/scene_baker.h
-
-// A blob that arrives in pieces. One thread at a time.
-class BlobWriter {
- public:
-  virtual ~BlobWriter() = default;  // without Commit(): what was written is dropped
-  // kInvalidArgument if more arrives than was announced.
-  virtual absl::Status Append(std::span<const std::byte> data) = 0;
-  // Makes the blob durable. kDataLoss if size or hash differ from what was announced.
-  virtual absl::Status Commit() = 0;
-};
 
 class CoordinatorApi {
  public:
@@ -110,7 +102,7 @@ class CoordinatorApi {
   virtual absl::Status Leave(const WorkerId& worker) = 0;
 };
 
-// What a caller may want to log; called with no lock held by the callee's caller, from any thread.
+// What a caller may want to log. From any thread; the callee must not call the coordinator.
 struct CoordinatorLogEntry {
   enum class Level { kInfo, kWarning, kError } level = Level::kInfo;
   std::string text;

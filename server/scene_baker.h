@@ -17,7 +17,8 @@ namespace farpoint {
 
 struct BakeResult {
   BakedScene blobs;
-  Camera camera;                   // the job's choice, resolved
+  std::vector<Camera> cameras;     // of the scene, or one made up: not empty
+  bool made_up_camera = false;     // then a note beginning with "no camera" says so
   std::vector<std::string> notes;  // one line each
   Stats stats;
 };
@@ -32,7 +33,7 @@ class SceneBaker {
                                           const std::atomic<bool>& cancel) = 0;
 };
 
-// import -> overrides -> camera and light -> Bake, on `threads` threads (0: all cores).
+// Import, overrides, camera and light if there are none, Bake: on `threads` threads (0: all cores).
 std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads);
 
 // What decides a bake's blobs and nothing else: the asset's files, overrides, light units, the

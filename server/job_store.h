@@ -1,0 +1,110 @@
+// What the coordinator must not forget: jobs, committed tiles, events, bakes. SQLite in WAL mode
+// with synchronous=FULL, tile bytes as files beside it, or everything in memory. Each method that
+// changes something returns when it is durable, and changes all or nothing, so that the process may
+// be killed at any instant.
+//
+// Leases are not stored: a tile without a row is queued when the store is opened again.
+// Errors: kUnavailable (disk full, I/O), kDataLoss (damaged), kFailedPrecondition (in use by
+// another process, written by a newer version); all name the file. Thread-safe.
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "core/base/blob.h"
+#include "core/base/hash.h"
+#include "core/base/stats.h"
+#include "core/base/status.h"
+#include "proto/job.h"
+
+namespace farpoint {
+
+// What a bake left behind, to be found by the next job with the same key.
+struct StoredBake {
+  SceneBlobs blobs;
+  std::vector<Camera> cameras;
+  bool made_up_camera = false;
+  std::vector<std::string> notes;
+  Stats stats;
+};
+
+struct StoredJob {
+  JobId id;
+  uint64_t number = 0;  // order of submission
+  JobSpec spec;
+  JobState state = JobState::kQueued;
+  absl::Status error;
+  int64_t submitted_unix_ms = 0;
+  // From the bake on.
+  std::optional<Camera> camera;
+  SceneBlobs blobs;
+  std::vector<std::string> notes;
+  Stats bake_stats;
+  // From the first committed tile on.
+  Digest fingerprint;
+  uint64_t reissued = 0, refused_results = 0;
+};
+
+struct StoredTile {
+  uint32_t tile = 0;
+  Digest sha256;
+  uint64_t size_bytes = 0;
+};
+
+struct StoredEvent {
+  uint64_t sequence = 0;
+  JobEventBody body;
+};
+
+class JobStore {
+ public:
+  // Files below `directory` (created if absent), which is locked against other processes. Empty: in
+  // memory.
+  static absl::StatusOr<std::unique_ptr<JobStore>> Open(const std::string& directory);
+  virtual ~JobStore() = default;
+
+  // --- Jobs ---
+  // All, in the order of submission. A job whose description this version refuses comes as failed.
+  virtual absl::StatusOr<std::vector<StoredJob>> LoadJobs() = 0;
+  // Inserts a queued job and its first event; sets job.number. kAlreadyExists: id or submission.
+  virtual absl::Status InsertJob(StoredJob& job, const std::string& submission_id) = 0;
+  virtual absl::StatusOr<std::optional<JobId>> FindSubmission(const std::string& id) = 0;
+  // With its event. A final state is never left: kFailedPrecondition.
+  virtual absl::Status SetState(const JobId& job, JobState state, const absl::Status& error) = 0;
+  // The job goes on to kRendering; its notes become events.
+  virtual absl::Status SetBaked(const JobId& job, const Camera& camera, const SceneBlobs& blobs,
+                                const std::vector<std::string>& notes, const Stats& stats) = 0;
+  virtual absl::Status SaveCounters(const JobId& job, uint64_t reissued, uint64_t refused) = 0;
+
+  // --- Tiles ---
+  // The bytes, the row, the event, and the job's fingerprint if it had none. kAlreadyExists if the
+  // tile is committed, kFailedPrecondition if the job has ended.
+  virtual absl::Status CommitTile(const JobId& job, uint32_t tile, const TileResult& result,
+                                  const Digest& fingerprint) = 0;
+  virtual absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) = 0;  // ascending
+  // Added in tile order.
+  virtual absl::StatusOr<Stats> TileStats(const JobId& job) = 0;
+  // kNotFound if it is not committed; kDataLoss if its bytes are damaged.
+  virtual absl::StatusOr<TileData> ReadTile(const JobId& job, uint32_t tile) = 0;
+  // Drops the tiles of an unfinished job whose bytes are missing or damaged; returns which.
+  virtual absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(const JobId& job) = 0;
+
+  // --- Events ---
+  virtual absl::StatusOr<std::vector<StoredEvent>> Events(const JobId& job, uint64_t after,
+                                                          uint32_t max) = 0;
+
+  // --- Bakes ---
+  virtual absl::StatusOr<std::optional<StoredBake>> FindBake(const Digest& key) = 0;
+  virtual absl::Status PutBake(const Digest& key, const StoredBake& bake) = 0;
+  virtual absl::Status RemoveBake(const Digest& key) = 0;
+
+  // Jobs that ended before `unix_ms`, with their tiles and events. Returns which.
+  virtual absl::StatusOr<std::vector<JobId>> Purge(int64_t unix_ms) = 0;
+};
+
+}  // namespace farpoint
