@@ -85,12 +85,13 @@ void Console::Progress(const JobStatus& status) {
     }
     if (report == last_report_) return;
     last_report_ = report;
-    std::string line = "farpoint: " + std::string(NameOf(status.state));
+    std::string line = "farpoint: ";
+    line.append(NameOf(status.state));
     if (status.tiles.total > 0) {
-      line += ", " + std::to_string(status.tiles.committed) + " of " +
-              std::to_string(status.tiles.total) + " tiles";
+      line.append(", ").append(std::to_string(status.tiles.committed)).append(" of ");
+      line.append(std::to_string(status.tiles.total)).append(" tiles");
     }
-    line += "\n";
+    line.append("\n");
     std::fwrite(line.data(), 1, line.size(), stream_);
   }
   std::fflush(stream_);

@@ -217,7 +217,7 @@ class GrpcFarmLink final : public FarmLink {
                                 const std::function<absl::Status(TileData)>& on_tile) {
     v1::TileChunk chunk;
     TileData tile;
-    std::vector<std::byte> bytes;
+    AlignedVector<std::byte> bytes;
     uint64_t size = 0;
     bool open = false;
     while (reader.Read(&chunk)) {
@@ -240,7 +240,7 @@ class GrpcFarmLink final : public FarmLink {
       const auto* begin = reinterpret_cast<const std::byte*>(data.data());
       bytes.insert(bytes.end(), begin, begin + data.size());
       if (bytes.size() == size) {
-        tile.bytes = Blob::FromVector(std::move(bytes));
+        tile.bytes = Blob::FromAligned(std::move(bytes));
         bytes = {};
         FP_RETURN_IF_ERROR(on_tile(std::move(tile)));
         tile = {};

@@ -402,18 +402,21 @@ absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec) {
   if (edit.spec.film.width == 0) {
     edit.spec.film = {kDefaultWidth, kDefaultHeight, {0, 0, kDefaultWidth, kDefaultHeight}};
   }
+  // Ranges live in one place, ValidateSettings; the flag that made the settings wrong is the one to
+  // blame. Only the end counts: a later flag may heal what an earlier one broke.
+  absl::Status settings_status = ValidateSettings(edit.spec.settings);
+  std::string blamed = "settings";
   for (const RenderFlag& flag : RenderFlags()) {
     for (const auto& [name, value] : given) {
       if (name != flag.name) continue;
       const std::string context = value.empty() ? name : name + " " + value;
-      const bool was_valid = ValidateSettings(edit.spec.settings).ok();
       FP_RETURN_IF_ERROR(Annotate(flag.apply(value, edit), context));
-      // Ranges live in one place; the flag that leaves them is the one to blame.
-      if (was_valid) {
-        FP_RETURN_IF_ERROR(Annotate(ValidateSettings(edit.spec.settings), context));
-      }
+      const bool was_valid = settings_status.ok();
+      settings_status = ValidateSettings(edit.spec.settings);
+      if (was_valid) blamed = context;
     }
   }
+  FP_RETURN_IF_ERROR(Annotate(settings_status, blamed));
   FP_RETURN_IF_ERROR(ResolveCameraFlags(edit));
   spec = std::move(edit.spec);
   return absl::OkStatus();

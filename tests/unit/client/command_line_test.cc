@@ -1,0 +1,220 @@
+#include "client/command_line.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "tests/unit/client/temp_folder.h"
+
+namespace farpoint {
+namespace {
+
+using testing::AllOf;
+using testing::ElementsAre;
+using testing::HasSubstr;
+using testing::Pair;
+using testing::StartsWith;
+
+CommandLine Parse(const std::vector<std::string>& args, const std::string& environment = "") {
+  auto line = ParseCommandLine(args, environment);
+  EXPECT_TRUE(line.ok()) << line.status();
+  return line.ok() ? *line : CommandLine{};
+}
+
+std::string Refusal(const std::vector<std::string>& args) {
+  const auto line = ParseCommandLine(args, "");
+  EXPECT_FALSE(line.ok());
+  const std::string text(line.status().message());
+  EXPECT_EQ(text.find('\n'), std::string::npos) << text;
+  return text;
+}
+
+TEST(CommandLine, Render) {
+  const CommandLine line =
+      Parse({"render", "a.gltf", "-o", "out.exr", "--workers", "3", "--threads", "2", "--json",
+             "s.json", "--png", "p.png", "--quiet", "--log-level", "debug", "--exposure", "-1.5"});
+  EXPECT_EQ(line.verb, Verb::kRender);
+  EXPECT_EQ(line.scene, "a.gltf");
+  EXPECT_EQ(line.output, "out.exr");
+  EXPECT_EQ(line.workers, 3u);
+  EXPECT_EQ(line.threads, 2u);
+  EXPECT_EQ(line.json, "s.json");
+  EXPECT_EQ(line.png, "p.png");
+  EXPECT_TRUE(line.quiet);
+  EXPECT_EQ(line.log_level, LogLevel::kDebug);
+  EXPECT_EQ(line.exposure_stops, -1.5f);
+  EXPECT_TRUE(line.render_flags.empty());
+}
+
+TEST(CommandLine, EveryRenderFlagReachesTheJob) {
+  for (const char* verb : {"render", "submit"}) {
+    for (const RenderFlag& flag : RenderFlags()) {
+      std::vector<std::string> args = {verb, "a.glb", "-o", "o.exr", "--quiet"};
+      if (std::string(verb) == "submit") {
+        args.insert(args.end(), {"--coordinator", "h:1"});
+      }
+      args.emplace_back(flag.name);
+      if (!flag.metavar.empty()) args.emplace_back("value");
+      EXPECT_THAT(Parse(args).render_flags,
+                  ElementsAre(Pair(std::string(flag.name), flag.metavar.empty() ? "" : "value")));
+    }
+  }
+}
+
+TEST(CommandLine, ValuesMayBeNegativeOrJoined) {
+  EXPECT_THAT(Parse({"render", "--eye", "-1,-2,3", "--target=-4,0,0", "a.glb", "-o", "o.exr"})
+                  .render_flags,
+              ElementsAre(Pair("--eye", "-1,-2,3"), Pair("--target", "-4,0,0")));
+}
+
+TEST(CommandLine, RepeatedFlagsCountOnceOrAll) {
+  EXPECT_THAT(Parse({"render", "a.glb", "-o", "o.exr", "--spp", "2", "--sun", "0,1,0:1,1,1",
+                     "--spp", "3", "--sun", "1,1,0:1,1,1"})
+                  .render_flags,
+              ElementsAre(Pair("--spp", "3"), Pair("--sun", "0,1,0:1,1,1"),
+                          Pair("--sun", "1,1,0:1,1,1")));
+}
+
+TEST(CommandLine, FlagsDoNotSwallowTheScene) {
+  const CommandLine line = Parse({"render", "--sun", "0,1,0:1,1,1", "a.glb", "-o", "o.exr"});
+  EXPECT_EQ(line.scene, "a.glb");
+}
+
+TEST(CommandLine, Submit) {
+  const CommandLine line = Parse({"submit", "a.json", "-o", "o.exr", "--coordinator", "farm:7420",
+                                  "--patience", "5.5", "--title", "my job", "--priority", "-7"});
+  EXPECT_EQ(line.verb, Verb::kSubmit);
+  EXPECT_EQ(line.coordinator, "farm:7420");
+  EXPECT_EQ(line.patience_s, 5.5);
+  EXPECT_EQ(line.title, "my job");
+  EXPECT_EQ(line.priority, -7);
+  EXPECT_FALSE(line.farm_ignores);
+  EXPECT_TRUE(Parse({"submit", "a.glb", "-o", "o.exr", "--coordinator", "h:1", "--workers", "2"})
+                  .farm_ignores);
+}
+
+TEST(CommandLine, DetachWritesNothing) {
+  EXPECT_TRUE(Parse({"submit", "a.glb", "--detach", "--coordinator", "h:1"}).detach);
+  EXPECT_THAT(Refusal({"submit", "a.glb", "--detach", "-o", "o.exr", "--coordinator", "h:1"}),
+              HasSubstr("farpoint fetch"));
+}
+
+TEST(CommandLine, CoordinatorFromTheEnvironmentOrTheFlag) {
+  EXPECT_EQ(Parse({"status"}, "env:1").coordinator, "env:1");
+  EXPECT_EQ(Parse({"status", "--coordinator", "flag:2"}, "env:1").coordinator, "flag:2");
+  EXPECT_THAT(Refusal({"status"}), HasSubstr("FARPOINT_COORDINATOR"));
+  for (const char* address : {"host", "host:", ":1", "host:0", "host:65536", "host:1x"}) {
+    EXPECT_THAT(Refusal({"status", "--coordinator", address}), HasSubstr("HOST:PORT")) << address;
+  }
+}
+
+TEST(CommandLine, StatusCancelFetch) {
+  const CommandLine status = Parse({"status", "12ab", "--json", "-", "--coordinator", "h:1"});
+  EXPECT_EQ(status.verb, Verb::kStatus);
+  EXPECT_EQ(status.job, "12ab");
+  EXPECT_EQ(status.json, "-");
+  EXPECT_EQ(Parse({"cancel", "12ab", "--coordinator", "h:1"}).verb, Verb::kCancel);
+  EXPECT_EQ(Parse({"fetch", "12ab", "-o", "o.exr", "--coordinator", "h:1"}).verb, Verb::kFetch);
+  EXPECT_THAT(Refusal({"cancel", "--coordinator", "h:1"}), StartsWith("JOB: not given"));
+  EXPECT_THAT(Refusal({"fetch", "x", "--coordinator", "h:1"}), StartsWith("-o: not given"));
+}
+
+TEST(CommandLine, Compare) {
+  const CommandLine line =
+      Parse({"compare", "a.exr", "b.exr", "--layer", "irradiance", "--ref-layer", "E", "--mask",
+             "m.npy", "--noise", "0.01", "--json", "c.json", "--diff", "d.png"});
+  EXPECT_EQ(line.verb, Verb::kCompare);
+  EXPECT_EQ(line.image_a, "a.exr");
+  EXPECT_EQ(line.image_b, "b.exr");
+  EXPECT_EQ(line.layer, "irradiance");
+  EXPECT_EQ(line.ref_layer, "E");
+  EXPECT_EQ(line.mask, "m.npy");
+  EXPECT_EQ(line.noise, 0.01);
+  EXPECT_EQ(line.diff, "d.png");
+  EXPECT_THAT(Refusal({"compare", "a.exr"}), HasSubstr("two .exr"));
+  EXPECT_THAT(Refusal({"compare", "a.exr", "b.exr", "--noise", "-1"}), StartsWith("--noise -1: "));
+}
+
+TEST(CommandLine, HelpAndVersionPrintAndNeedNothingElse) {
+  for (const char* verb : {"render", "submit", "status", "cancel", "fetch", "compare"}) {
+    const CommandLine line = Parse({verb, "--help"});
+    ASSERT_TRUE(line.print.has_value());
+    EXPECT_THAT(*line.print, HasSubstr("--log-level"));
+    EXPECT_THAT(*Parse({"--help"}).print, HasSubstr(std::string("farpoint ") + verb));
+  }
+  for (const RenderFlag& flag : RenderFlags()) {
+    EXPECT_THAT(*Parse({"render", "-h"}).print, HasSubstr(std::string(flag.name)));
+  }
+  EXPECT_THAT(*Parse({"--version"}).print, StartsWith("farpoint " FARPOINT_VERSION));
+}
+
+TEST(CommandLine, NamesTheNearestCommandAndFlag) {
+  EXPECT_THAT(Refusal({"rendr"}), HasSubstr("did you mean render?"));
+  EXPECT_THAT(Refusal({"xyzzy"}), HasSubstr("farpoint --help"));
+  EXPECT_THAT(Refusal({}), HasSubstr("farpoint --help"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--resolutoin", "4x4"}),
+              AllOf(StartsWith("--resolutoin: "), HasSubstr("did you mean --resolution?")));
+  EXPECT_THAT(Refusal({"render", "--resolutoin=4x4", "a.glb", "-o", "o.exr"}),
+              HasSubstr("did you mean --resolution?"));
+  EXPECT_THAT(Refusal({"status", "--spp", "4"}), HasSubstr("unknown flag of farpoint status"));
+}
+
+TEST(CommandLine, RefusesWhatIsNotBuiltYet) {
+  for (const char* flag : {"--fill", "--quality", "--env"}) {
+    EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", flag, "x"}),
+                AllOf(StartsWith(flag), HasSubstr("not built yet")));
+  }
+  EXPECT_THAT(Refusal({"render", "a.obj", "-o", "o.exr"}), HasSubstr("not built yet"));
+}
+
+TEST(CommandLine, RefusesWhatIsMissingTooMuchOrWrong) {
+  EXPECT_THAT(Refusal({"render", "-o", "o.exr"}), StartsWith("SCENE: not given"));
+  EXPECT_THAT(Refusal({"render", "a.glb"}), StartsWith("-o: not given"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.png"}), HasSubstr(".exr"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--png", "o.jpg"}), HasSubstr(".png"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "b.glb", "-o", "o.exr"}),
+              HasSubstr("one argument too many"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o"}), HasSubstr("--output"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--workers", "0"}),
+              StartsWith("--workers 0: expected a whole number from 1 to 256"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--threads", "two"}),
+              StartsWith("--threads two: "));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--log-level", "loud"}),
+              StartsWith("--log-level loud: "));
+}
+
+class ConfigFile : public testing::Test {
+ protected:
+  std::string Write(const std::string& text) { return folder_.Write("f.conf", text); }
+  TempFolder folder_;
+};
+
+TEST_F(ConfigFile, GivesFlagsThatTheCommandLineOverrides) {
+  const std::string path = Write("# a comment\nspp = 4\n\n  tile=64 \r\nno-skip = true\n"
+                                 "quiet = false\noutput = \"from file.exr\"\n; another\n");
+  const CommandLine line = Parse({"render", "a.glb", "--config", path, "--spp", "8"});
+  EXPECT_THAT(line.render_flags,
+              ElementsAre(Pair("--spp", "8"), Pair("--tile", "64"), Pair("--no-skip", "")));
+  EXPECT_FALSE(line.quiet);
+  EXPECT_EQ(line.output, "from file.exr");
+}
+
+TEST_F(ConfigFile, NamesFileLineAndNearestName) {
+  const std::string path = Write("spp = 4\ntiel = 64\n");
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", path}),
+              AllOf(StartsWith(path + ":2: "), HasSubstr("did you mean --tile?")));
+}
+
+TEST_F(ConfigFile, RefusesWhatIsNoSetting) {
+  for (const char* text : {"spp\n", "no-skip = yes\n", "config = other\n", "help = true\n",
+                           "[render]\n", "fill = cut\n"}) {
+    const std::string path = Write(text);
+    EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", path}),
+                StartsWith(path + ":1: "))
+        << text;
+  }
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", "/nowhere/x"}),
+              HasSubstr("/nowhere/x"));
+}
+
+}  // namespace
+}  // namespace farpoint

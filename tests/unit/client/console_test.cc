@@ -1,0 +1,142 @@
+#include "client/console.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <memory>
+#include <string>
+
+namespace farpoint {
+namespace {
+
+struct CloseFile {
+  void operator()(std::FILE* file) const { std::fclose(file); }
+};
+
+// A stream whose text can be read back.
+class Capture {
+ public:
+  Capture() : file_(std::tmpfile()) {}
+  std::FILE* file() { return file_.get(); }
+  std::string Text() {
+    std::fflush(file());
+    std::string text(static_cast<size_t>(std::ftell(file())), '\0');
+    std::rewind(file());
+    EXPECT_EQ(std::fread(text.data(), 1, text.size(), file()), text.size());
+    return text;
+  }
+
+ private:
+  std::unique_ptr<std::FILE, CloseFile> file_;
+};
+
+JobStatus Rendering(uint32_t committed, uint32_t total) {
+  JobStatus status;
+  status.state = JobState::kRendering;
+  status.tiles = {.queued = total - committed, .committed = committed, .total = total};
+  status.progress = static_cast<double>(committed) / total;
+  return status;
+}
+
+TEST(Console, PutsItsNameInFrontOfEachLine) {
+  Capture capture;
+  Console console(capture.file(), false, LogLevel::kInfo, false);
+  console.Error("film is empty");
+  console.Warn("slow");
+  console.Info("job 1");
+  EXPECT_EQ(capture.Text(), "farpoint: error: film is empty\nfarpoint: warning: slow\n"
+                            "farpoint: job 1\n");
+}
+
+TEST(Console, ShowsOnlyWhatItsLevelLetsThrough) {
+  Capture capture;
+  Console console(capture.file(), false, LogLevel::kError, false);
+  console.Debug("a");
+  console.Info("b");
+  console.Warn("c");
+  console.Progress(Rendering(1, 2));
+  console.Error("d");
+  EXPECT_EQ(capture.Text(), "farpoint: error: d\n");
+}
+
+TEST(Console, IsQuietButForWarningsAndErrors) {
+  Capture capture;
+  Console console(capture.file(), true, LogLevel::kDebug, true);
+  console.Info("a");
+  console.Progress(Rendering(1, 2));
+  console.Warn("b");
+  EXPECT_EQ(capture.Text(), "farpoint: warning: b\n");
+}
+
+TEST(Console, WritesALinePerTenthWhereThereIsNoTerminal) {
+  Capture capture;
+  Console console(capture.file(), false, LogLevel::kInfo, false);
+  for (uint32_t i = 0; i <= 100; ++i) console.Progress(Rendering(i, 100));
+  const std::string text = capture.Text();
+  EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 11) << text;
+  EXPECT_EQ(text.find('\x1b'), std::string::npos);
+  EXPECT_NE(text.find("farpoint: rendering, 50 of 100 tiles\n"), std::string::npos);
+}
+
+TEST(Console, RedrawsOneLineOnATerminal) {
+  Capture capture;
+  Console console(capture.file(), true, LogLevel::kInfo, false);
+  for (uint32_t i = 0; i <= 10; ++i) console.Progress(Rendering(i, 10));
+  const std::string text = capture.Text();
+  EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 0);
+  EXPECT_EQ(std::count(text.begin(), text.end(), '\r'), 11);
+}
+
+TEST(Console, ClearsTheBarBeforeAMessage) {
+  Capture capture;
+  Console console(capture.file(), true, LogLevel::kInfo, false);
+  console.Progress(Rendering(1, 10));
+  console.Info("note");
+  const std::string text = capture.Text();
+  EXPECT_TRUE(text.ends_with("\r\x1b[Kfarpoint: note\n")) << text;
+}
+
+TEST(ProgressText, ShowsBarShareTilesAndTimeLeft) {
+  JobStatus status = Rendering(1, 4);
+  status.eta_s = 65;
+  status.reissued = 2;
+  const std::string text = ProgressText(status, 79);
+  EXPECT_NE(text.find(" 25 %  1/4 tiles  2 again  eta 1:05"), std::string::npos) << text;
+  EXPECT_LE(text.size(), 79u);
+  const auto bar = text.substr(0, text.find(']'));
+  const auto full = std::count(bar.begin(), bar.end(), '#');
+  const auto empty = std::count(bar.begin(), bar.end(), '-');
+  EXPECT_NEAR(static_cast<double>(full) / (full + empty), 0.25, 0.03);
+}
+
+TEST(ProgressText, NamesTheStateBeforeThereAreTiles) {
+  JobStatus status;
+  status.state = JobState::kBaking;
+  EXPECT_EQ(ProgressText(status, 79), "baking");
+}
+
+TEST(ProgressText, StaysInsideNarrowTerminalsAndOddNumbers) {
+  JobStatus status = Rendering(1, 3);
+  status.progress = 7;
+  for (int columns = 20; columns < 100; ++columns) {
+    const std::string text = ProgressText(status, columns);
+    EXPECT_LE(static_cast<int>(text.size()), std::max(columns, 24)) << text;
+  }
+}
+
+TEST(DurationText, GroupsSeconds) {
+  EXPECT_EQ(DurationText(0), "0:00");
+  EXPECT_EQ(DurationText(65.4), "1:05");
+  EXPECT_EQ(DurationText(7384), "2:03:04");
+  EXPECT_EQ(DurationText(-3), "0:00");
+}
+
+TEST(LogLevelFromName, KnowsItsNamesOnly) {
+  EXPECT_EQ(*LogLevelFromName("debug"), LogLevel::kDebug);
+  EXPECT_EQ(*LogLevelFromName("off"), LogLevel::kOff);
+  EXPECT_FALSE(LogLevelFromName("loud").ok());
+}
+
+}  // namespace
+}  // namespace farpoint
