@@ -41,6 +41,15 @@ std::string RandomHex(int digits) {
   return text;
 }
 
+// Progress is reported by the block: no lease may be shorter than what one may take, estimated
+// generously on one slow thread (20 µs a path, 2 ms a receiver). At most a day.
+std::chrono::milliseconds BlockTime(const RenderSettings& settings) {
+  const double receivers = 1.0 * kBlockSize * kBlockSize * settings.spp;
+  const double seconds =
+      receivers * (settings.integrator == Integrator::kPt ? 2e-5 * settings.paths : 2e-3);
+  return std::chrono::milliseconds(static_cast<int64_t>(1000 * std::min(seconds, 86400.0)));
+}
+
 SchedulerOptions SchedulerOptionsOf(const CoordinatorOptions& options) {
   SchedulerOptions s;
   s.silence_time = options.silence_time;
@@ -306,7 +315,7 @@ class CoordinatorImpl final : public Coordinator {
                       .film = job.stored.spec.film,
                       .settings = job.stored.spec.settings};
         work.blobs = job.stored.blobs;
-        work.lease_time = options_.lease_time;
+        work.lease_time = std::max(options_.lease_time, BlockTime(job.stored.spec.settings));
         return work;
       }
       const auto now = std::chrono::steady_clock::now();
@@ -536,6 +545,7 @@ class CoordinatorImpl final : public Coordinator {
     for (const StoredTile& tile : committed) scheduled.committed.push_back(tile.tile);
     if (!committed.empty()) scheduled.fingerprint = job.stored.fingerprint;
     scheduled.max_time = std::chrono::seconds(job.stored.spec.limits.max_seconds);
+    scheduled.lease_time = BlockTime(job.stored.spec.settings);
     job.stored.state = JobState::kRendering;
     scheduler_.AddJob(scheduled);
   }

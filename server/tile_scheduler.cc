@@ -492,7 +492,8 @@ SchedulerNews TileScheduler::Tick() {
     if (now - live.heard >= options_.silence_time) {
       expired.emplace_back(live.grant,
                            "nothing was heard of the worker for " + SecondsText(now - live.heard));
-    } else if (now - live.progressed >= options_.lease_time) {
+    } else if (now - live.progressed >=
+               std::max(options_.lease_time, jobs_.at(live.grant.job).spec.lease_time)) {
       expired.emplace_back(live.grant, "no progress for " + SecondsText(now - live.progressed));
     }
   }

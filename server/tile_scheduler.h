@@ -47,6 +47,7 @@ struct ScheduledJob {
   std::vector<uint32_t> committed;      // tiles that are done already
   Digest fingerprint;                   // of the committed tiles; empty if there are none
   Duration max_time = Duration::max();  // from the first lease on
+  Duration lease_time{};                // if longer than the options' one
 };
 
 struct LeaseGrant {

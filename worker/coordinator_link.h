@@ -22,7 +22,7 @@ class CoordinatorLink {
  public:
   virtual ~CoordinatorLink() = default;
   virtual absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) = 0;
-  // Waits up to `wait` for work. Cancel() ends the wait.
+  // Waits up to `wait` for work.
   virtual absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                         std::chrono::milliseconds wait) = 0;
   virtual absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
@@ -31,6 +31,18 @@ class CoordinatorLink {
   virtual absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                                      const absl::Status& error) = 0;
   virtual absl::Status Leave(const WorkerId& worker) = 0;
+  // Ends a wait in Lease() soon, and those to come: kCancelled.
+  virtual void CancelWaits() = 0;
+};
+
+// A blob's bytes from `offset` on, in order; `sink` gets the size of the whole blob and the next
+// bytes, on the calling thread, and its error ends the stream. kNotFound if the coordinator does
+// not have it. Thread-safe.
+class BlobStreamer {
+ public:
+  using Sink = std::function<absl::Status(uint64_t size_bytes, std::span<const std::byte> data)>;
+  virtual ~BlobStreamer() = default;
+  virtual absl::Status Stream(const Digest& digest, uint64_t offset_bytes, const Sink& sink) = 0;
 };
 
 // Where blobs come from.

@@ -3,6 +3,9 @@
 // template keeps the worker free of the server's headers.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
+
 #include "worker/coordinator_link.h"
 
 namespace farpoint {
@@ -18,7 +21,14 @@ class InProcessLink final : public CoordinatorLink, public BlobSource {
   }
   absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                 std::chrono::milliseconds wait) override {
-    return api_.Lease(worker, wait);
+    // In slices, so that CancelWaits is heard.
+    constexpr std::chrono::milliseconds kSlice{100};
+    for (;;) {
+      if (cancelled_.load()) return absl::CancelledError("the worker stops");
+      auto work = api_.Lease(worker, std::min(wait, kSlice));
+      if (!work.ok() || work->has_value() || wait <= kSlice) return work;
+      wait -= kSlice;
+    }
   }
   absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
                                     const LeaseProgress& progress) override {
@@ -32,6 +42,7 @@ class InProcessLink final : public CoordinatorLink, public BlobSource {
     return api_.ReportFailure(worker, lease, given_back, error);
   }
   absl::Status Leave(const WorkerId& worker) override { return api_.Leave(worker); }
+  void CancelWaits() override { cancelled_ = true; }
 
   absl::StatusOr<Blob> Get(const Digest& digest, const std::function<bool()>& progress) override {
     if (progress && !progress()) return absl::CancelledError("the tile was dropped");
@@ -40,6 +51,7 @@ class InProcessLink final : public CoordinatorLink, public BlobSource {
 
  private:
   Api& api_;
+  std::atomic<bool> cancelled_ = false;
 };
 
 }  // namespace farpoint

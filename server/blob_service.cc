@@ -1,0 +1,90 @@
+#include "proto/convert.h"
+#include "proto/farpoint.grpc.pb.h"
+#include "proto/grpc_status.h"
+#include "server/grpc_services.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr int kMaxAsked = 65536;
+
+class BlobServiceImpl final : public v1::BlobService::Service {
+ public:
+  explicit BlobServiceImpl(CoordinatorApi& coordinator) : coordinator_(coordinator) {}
+
+  grpc::Status FindMissing(grpc::ServerContext*, const v1::FindMissingRequest* request,
+                           v1::FindMissingResponse* response) override {
+    return ToGrpc([&]() -> absl::Status {
+      if (request->sha256_size() > kMaxAsked) {
+        return absl::InvalidArgumentError("sha256 has " + std::to_string(request->sha256_size()) +
+                                          " entries; allowed: at most " +
+                                          std::to_string(kMaxAsked));
+      }
+      std::vector<Digest> digests;
+      for (const std::string& hex : request->sha256()) {
+        FP_ASSIGN_OR_RETURN(digests.emplace_back(), DigestFromWire(hex, "sha256"));
+      }
+      FP_ASSIGN_OR_RETURN(const std::vector<Digest> missing, coordinator_.FindMissing(digests));
+      for (const Digest& digest : missing) response->add_sha256(digest.Hex());
+      return absl::OkStatus();
+    }());
+  }
+
+  grpc::Status Put(grpc::ServerContext*, grpc::ServerReader<v1::PutBlobChunk>* stream,
+                   v1::PutBlobResponse*) override {
+    return ToGrpc([&]() -> absl::Status {
+      v1::PutBlobChunk chunk;
+      if (!stream->Read(&chunk)) return absl::InvalidArgumentError("Put without a message");
+      FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(chunk.sha256(), "sha256"));
+      FP_ASSIGN_OR_RETURN(const std::unique_ptr<BlobWriter> writer,
+                          coordinator_.StartPut(digest, chunk.size_bytes()));
+      do {
+        if (chunk.data().size() > kChunkBytes) {
+          return absl::InvalidArgumentError("data has " + std::to_string(chunk.data().size()) +
+                                            " bytes; allowed: at most " +
+                                            std::to_string(kChunkBytes));
+        }
+        FP_RETURN_IF_ERROR(
+            writer->Append(std::as_bytes(std::span(chunk.data().data(), chunk.data().size()))));
+      } while (stream->Read(&chunk));
+      return writer->Commit();
+    }());
+  }
+
+  grpc::Status Get(grpc::ServerContext*, const v1::GetBlobRequest* request,
+                   grpc::ServerWriter<v1::GetBlobChunk>* stream) override {
+    return ToGrpc([&]() -> absl::Status {
+      FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(request->sha256(), "sha256"));
+      FP_ASSIGN_OR_RETURN(const Blob blob, coordinator_.GetBlob(digest));
+      const std::span<const std::byte> bytes = blob.bytes();
+      if (request->offset_bytes() > bytes.size()) {
+        return absl::OutOfRangeError("offset_bytes is " + std::to_string(request->offset_bytes()) +
+                                     ", the blob has " + std::to_string(bytes.size()));
+      }
+      size_t at = static_cast<size_t>(request->offset_bytes());
+      v1::GetBlobChunk chunk;
+      chunk.set_size_bytes(bytes.size());
+      do {
+        const size_t size = std::min(kChunkBytes, bytes.size() - at);
+        chunk.set_data(bytes.data() + at, size);
+        at += size;
+        // Blocks while the peer does not read: at most a few chunks are in memory.
+        if (!stream->Write(chunk)) return absl::CancelledError("the peer is gone");
+        chunk.clear_size_bytes();
+      } while (at < bytes.size());
+      return absl::OkStatus();
+    }());
+  }
+
+ private:
+  CoordinatorApi& coordinator_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator) {
+  return std::make_unique<BlobServiceImpl>(coordinator);
+}
+
+}  // namespace farpoint

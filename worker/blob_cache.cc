@@ -1,0 +1,203 @@
+#include "worker/blob_cache.h"
+
+#include <fcntl.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <chrono>
+#include <cstring>
+#include <filesystem>
+#include <thread>
+#include <vector>
+
+namespace farpoint {
+
+namespace fs = std::filesystem;
+
+namespace {
+
+absl::Status DiskError(const std::string& what, const std::string& path, int error) {
+  const std::string text = what + " '" + path + "': " + std::strerror(error);
+  if (error == ENOSPC || error == EDQUOT) {
+    return absl::ResourceExhaustedError(text + "; free some space or choose another --cache");
+  }
+  return absl::UnavailableError(text);
+}
+
+struct Descriptor {
+  int fd = -1;
+  ~Descriptor() {
+    if (fd >= 0) ::close(fd);
+  }
+};
+
+absl::Status Cancelled() { return absl::CancelledError("the tile was dropped"); }
+
+// Adds the file's first `size` bytes to `hash`.
+absl::Status HashStart(int fd, uint64_t size, const std::string& path, Sha256& hash) {
+  std::vector<std::byte> buffer(kChunkBytes);
+  uint64_t at = 0;
+  while (at < size) {
+    const size_t want = static_cast<size_t>(std::min<uint64_t>(buffer.size(), size - at));
+    const ssize_t n = ::pread(fd, buffer.data(), want, static_cast<off_t>(at));
+    if (n < 0 && errno == EINTR) continue;
+    if (n <= 0) return DiskError("cannot read", path, n == 0 ? EIO : errno);
+    hash.Update(std::span(buffer.data(), static_cast<size_t>(n)));
+    at += static_cast<uint64_t>(n);
+  }
+  return absl::OkStatus();
+}
+
+}  // namespace
+
+absl::StatusOr<std::unique_ptr<BlobCache>> BlobCache::Open(const BlobCacheOptions& options,
+                                                           BlobStreamer& streamer) {
+  std::error_code error;
+  fs::create_directories(options.directory, error);
+  if (error) return DiskError("cannot create", options.directory, error.value());
+  return std::unique_ptr<BlobCache>(new BlobCache(options, streamer));
+}
+
+absl::StatusOr<Blob> BlobCache::FromFolder(const Digest& digest) {
+  const std::string path = PathOf(digest);
+  FP_ASSIGN_OR_RETURN(Blob blob, Blob::MapFile(path));
+  ::utimensat(AT_FDCWD, path.c_str(), nullptr, 0);  // last use, for Evict
+  {
+    std::lock_guard lock(mutex_);
+    if (verified_.contains(digest)) return blob;
+  }
+  if (blob.Hash() != digest) {
+    ::unlink(path.c_str());
+    return absl::NotFoundError("'" + path + "' was damaged and is removed");
+  }
+  std::lock_guard lock(mutex_);
+  verified_.insert(digest);
+  return blob;
+}
+
+absl::StatusOr<Blob> BlobCache::Get(const Digest& digest, const std::function<bool()>& progress) {
+  absl::StatusOr<Blob> blob = FromFolder(digest);
+  if (blob.ok() || !absl::IsNotFound(blob.status())) return blob;
+  absl::Status fetched = Fetch(digest, progress);
+  // A part that an earlier process left may be damaged: once more, from the start.
+  if (absl::IsDataLoss(fetched)) fetched = Fetch(digest, progress);
+  FP_RETURN_IF_ERROR(fetched);
+  blob = FromFolder(digest);
+  Evict(digest);
+  return blob;
+}
+
+absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>& progress) {
+  const std::string path = PathOf(digest);
+  const std::string part = path + ".part";
+  Descriptor file;
+  for (;;) {
+    file.fd = ::open(part.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0644);
+    if (file.fd < 0) return DiskError("cannot create", part, errno);
+    while (::flock(file.fd, LOCK_EX | LOCK_NB) != 0) {
+      if (errno != EWOULDBLOCK && errno != EINTR) return DiskError("cannot lock", part, errno);
+      if (progress && !progress()) return Cancelled();
+      std::this_thread::sleep_for(std::chrono::milliseconds(50));
+    }
+    // Whoever had the lock may have finished the file or thrown it away.
+    struct stat now {
+    }, opened{};
+    if (::fstat(file.fd, &opened) == 0 && ::stat(part.c_str(), &now) == 0 &&
+        now.st_ino == opened.st_ino) {
+      break;
+    }
+    ::close(file.fd);
+    file.fd = -1;
+    if (::access(path.c_str(), F_OK) == 0) return absl::OkStatus();
+  }
+  struct stat info {};
+  if (::fstat(file.fd, &info) != 0) return DiskError("cannot examine", part, errno);
+  uint64_t have = static_cast<uint64_t>(info.st_size);
+  Sha256 hash;
+  FP_RETURN_IF_ERROR(HashStart(file.fd, have, part, hash));
+
+  uint64_t total = have;
+  const auto throw_away = [&](const absl::Status& status) {
+    ::unlink(part.c_str());
+    return status;
+  };
+  const absl::Status streamed = streamer_.Stream(
+      digest, have, [&](uint64_t size, std::span<const std::byte> data) -> absl::Status {
+        if (progress && !progress()) return Cancelled();
+        if (size > options_.max_blob_bytes) {
+          return absl::ResourceExhaustedError("blob " + digest.Hex() + " has " +
+                                              std::to_string(size) + " bytes, the cache takes " +
+                                              std::to_string(options_.max_blob_bytes));
+        }
+        total = size;
+        if (have > size || data.size() > size - have) {
+          return absl::DataLossError("blob " + digest.Hex() + " is longer than announced");
+        }
+        size_t done = 0;
+        while (done < data.size()) {
+          const ssize_t n = ::pwrite(file.fd, data.data() + done, data.size() - done,
+                                     static_cast<off_t>(have + done));
+          if (n < 0 && errno == EINTR) continue;
+          if (n <= 0) return DiskError("cannot write", part, n == 0 ? ENOSPC : errno);
+          done += static_cast<size_t>(n);
+        }
+        hash.Update(data);
+        have += data.size();
+        return absl::OkStatus();
+      });
+  if (!streamed.ok()) {
+    const absl::Status told = Annotate(streamed, "blob " + digest.Hex());
+    // An offset beyond the end: the part is not of this blob.
+    if (absl::IsOutOfRange(streamed)) return throw_away(absl::DataLossError(told.message()));
+    return absl::IsDataLoss(streamed) ? throw_away(told) : told;
+  }
+  if (have != total) {
+    return absl::UnavailableError("blob " + digest.Hex() + " ended after " + std::to_string(have) +
+                                  " of " + std::to_string(total) + " bytes");
+  }
+  if (hash.Finish() != digest) {
+    return throw_away(absl::DataLossError("blob " + digest.Hex() + " arrived with other contents"));
+  }
+  if (::fsync(file.fd) != 0) return DiskError("cannot flush", part, errno);
+  if (::rename(part.c_str(), path.c_str()) != 0) return DiskError("cannot rename to", path, errno);
+  std::lock_guard lock(mutex_);
+  verified_.insert(digest);
+  return absl::OkStatus();
+}
+
+void BlobCache::Evict(const Digest& but) {
+  struct Entry {
+    fs::file_time_type used;
+    uint64_t size;
+    Digest digest;
+  };
+  std::vector<Entry> entries;
+  uint64_t total = 0;
+  std::error_code error;
+  for (fs::directory_iterator at(options_.directory, error), end; !error && at != end;
+       at.increment(error)) {
+    const absl::StatusOr<Digest> digest = Digest::FromHex(at->path().filename().string());
+    if (!digest.ok()) continue;
+    std::error_code ignored;
+    const Entry entry{at->last_write_time(ignored), at->file_size(ignored), *digest};
+    if (ignored) continue;  // another worker removed it
+    entries.push_back(entry);
+    total += entry.size;
+  }
+  std::sort(entries.begin(), entries.end(),
+            [](const Entry& a, const Entry& b) { return a.used < b.used; });
+  for (const Entry& entry : entries) {
+    if (total <= options_.max_bytes) return;
+    if (entry.digest == but) continue;
+    // Whoever has it mapped keeps it until it is done.
+    ::unlink(PathOf(entry.digest).c_str());
+    std::lock_guard lock(mutex_);
+    verified_.erase(entry.digest);
+    total -= entry.size;
+  }
+}
+
+}  // namespace farpoint

@@ -1,0 +1,50 @@
+// A worker's blobs on disk: files named by their SHA-256, mapped into memory. A blob is fetched
+// once, in <name>.part, and renamed when its hash is right; an interrupted download goes on where
+// it stopped, in the next process too. Several workers may share the folder. Thread-safe.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <set>
+#include <string>
+
+#include "core/base/blob.h"
+#include "core/base/hash.h"
+#include "core/base/status.h"
+#include "worker/coordinator_link.h"
+
+namespace farpoint {
+
+struct BlobCacheOptions {
+  std::string directory;                        // created if absent
+  uint64_t max_bytes = uint64_t{64} << 30;      // the least recently used go first
+  uint64_t max_blob_bytes = uint64_t{1} << 36;  // larger ones are refused before they are fetched
+};
+
+class BlobCache final : public BlobSource {
+ public:
+  // `streamer` must outlive this.
+  static absl::StatusOr<std::unique_ptr<BlobCache>> Open(const BlobCacheOptions& options,
+                                                         BlobStreamer& streamer);
+
+  // From the folder if it is there and undamaged (its hash is checked when this process first uses
+  // it), else from the coordinator. Waits while another worker fetches the same blob. kDataLoss if
+  // what arrives has the wrong hash twice, kResourceExhausted if the disk is full.
+  absl::StatusOr<Blob> Get(const Digest& digest, const std::function<bool()>& progress) override;
+
+ private:
+  BlobCache(BlobCacheOptions options, BlobStreamer& streamer)
+      : options_(std::move(options)), streamer_(streamer) {}
+  std::string PathOf(const Digest& digest) const { return options_.directory + "/" + digest.Hex(); }
+  absl::StatusOr<Blob> FromFolder(const Digest& digest);
+  absl::Status Fetch(const Digest& digest, const std::function<bool()>& progress);
+  void Evict(const Digest& but);
+
+  const BlobCacheOptions options_;
+  BlobStreamer& streamer_;
+  std::mutex mutex_;
+  std::set<Digest> verified_;  // guarded by mutex_
+};
+
+}  // namespace farpoint

@@ -1,0 +1,17 @@
+// What this machine's arithmetic makes of a small fixed picture. Two workers with one fingerprint
+// give one image the same bits (DESIGN: determinism); a processor whose reciprocals differ, or
+// another version, has another fingerprint.
+#pragma once
+
+#include "core/base/executor.h"
+#include "core/base/hash.h"
+#include "core/base/status.h"
+
+namespace farpoint {
+
+// SHA-256 over the version and the hashes of a 32x32 picture of the Cornell box by the factorized
+// integrator and by the path tracer, few points and paths. Takes well under a second; independent
+// of the executor.
+absl::StatusOr<Digest> ComputeFingerprint(Executor& executor);
+
+}  // namespace farpoint

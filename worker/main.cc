@@ -1,0 +1,179 @@
+// farpoint-worker: flags, log, signals. Everything else is the worker's.
+#include <pthread.h>
+#include <spdlog/sinks/stdout_color_sinks.h>
+#include <spdlog/spdlog.h>
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <atomic>
+#include <chrono>
+#include <csignal>
+#include <cstdio>
+#include <cstdlib>
+#include <string>
+#include <thread>
+
+#include "core/base/executor.h"
+#include "worker/blob_cache.h"
+#include "worker/fingerprint.h"
+#include "worker/grpc_link.h"
+#include "worker/tile_renderer.h"
+#include "worker/worker.h"
+
+namespace farpoint {
+namespace {
+
+constexpr int kExitUsage = 2;
+constexpr int kExitPermanent = 42;
+constexpr int kExitTryAgain = 75;
+
+struct WorkerFlags {
+  std::string coordinator, cache, name, log_level = "info";
+  unsigned threads = 0;
+  uint64_t cache_bytes = uint64_t{64} << 30;
+  uint64_t cached_scenes = 2;
+  uint64_t drain_seconds = 10;
+};
+
+std::string DefaultCache() {
+  if (const char* xdg = std::getenv("XDG_CACHE_HOME"); xdg != nullptr && *xdg != '\0') {
+    return std::string(xdg) + "/farpoint";
+  }
+  if (const char* home = std::getenv("HOME"); home != nullptr && *home != '\0') {
+    return std::string(home) + "/.cache/farpoint";
+  }
+  return "";
+}
+
+std::string DefaultName() {
+  char host[128] = "worker";
+  ::gethostname(host, sizeof(host) - 1);
+  return std::string(host) + ":" + std::to_string(::getpid());
+}
+
+int ExitCodeOf(const absl::Status& status) {
+  return absl::IsUnavailable(status) || absl::IsResourceExhausted(status) ? kExitTryAgain
+                                                                          : kExitPermanent;
+}
+
+void DefineFlags(CLI::App& app, WorkerFlags& flags) {
+  app.set_version_flag("--version", "farpoint-worker " FARPOINT_VERSION);
+  app.set_config("--config", "", "Flags from a file: one NAME=VALUE a line, without the dashes");
+  app.add_option("--coordinator", flags.coordinator, "HOST:PORT of farpoint-server")->required();
+  app.add_option("--cache", flags.cache, "Folder for scenes; workers of one machine may share it")
+      ->capture_default_str();
+  app.add_option("--cache-bytes", flags.cache_bytes, "Most bytes in the cache")
+      ->check(CLI::Range(uint64_t{1} << 20, uint64_t{1} << 62))
+      ->capture_default_str();
+  app.add_option("--threads", flags.threads, "Threads; 0: all cores")->capture_default_str();
+  app.add_option("--name", flags.name, "Shown by `farpoint status`")->capture_default_str();
+  app.add_option("--cached-scenes", flags.cached_scenes, "Scenes kept in memory")
+      ->check(CLI::Range(1, 1000))
+      ->capture_default_str();
+  app.add_option("--drain-seconds", flags.drain_seconds,
+                 "How long a stop lets the tile in work go on before it is given back")
+      ->check(CLI::Range(0, 86400))
+      ->capture_default_str();
+  app.add_option("--log-level", flags.log_level, "What is logged to stderr")
+      ->check(CLI::IsMember({"trace", "debug", "info", "warning", "error", "off"}))
+      ->capture_default_str();
+}
+
+void LogEntry(const WorkerLogEntry& entry) {
+  std::string line;
+  if (!entry.job.empty()) line += "job=" + entry.job.value + " ";
+  if (entry.tile) line += "tile=" + std::to_string(*entry.tile) + " ";
+  if (entry.attempt != 0) line += "attempt=" + std::to_string(entry.attempt) + " ";
+  line += entry.text;
+  switch (entry.level) {
+    case WorkerLogEntry::Level::kInfo:
+      spdlog::info("{}", line);
+      break;
+    case WorkerLogEntry::Level::kWarning:
+      spdlog::warn("{}", line);
+      break;
+    case WorkerLogEntry::Level::kError:
+      spdlog::error("{}", line);
+      break;
+  }
+}
+
+int Main(int argc, char** argv) {
+  WorkerFlags flags;
+  flags.cache = DefaultCache();
+  flags.name = DefaultName();
+  CLI::App app{"farpoint-worker: renders tiles for a farpoint-server."};
+  DefineFlags(app, flags);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& error) {
+    return app.exit(error) == 0 ? 0 : kExitUsage;
+  }
+  if (flags.cache.empty()) {
+    std::fprintf(stderr, "farpoint-worker: there is no home folder; give --cache DIR\n");
+    return kExitUsage;
+  }
+  spdlog::set_default_logger(spdlog::stderr_color_mt("farpoint-worker"));
+  spdlog::set_level(spdlog::level::from_str(flags.log_level));
+
+  // Before any thread starts, so that all inherit the mask and only the waiting one hears them.
+  sigset_t signals;
+  sigemptyset(&signals);
+  sigaddset(&signals, SIGTERM);
+  sigaddset(&signals, SIGINT);
+  ::pthread_sigmask(SIG_BLOCK, &signals, nullptr);
+  std::signal(SIGPIPE, SIG_IGN);
+
+  WorkerOptions options;
+  {
+    Executor executor(flags.threads);
+    const absl::StatusOr<Digest> fingerprint = ComputeFingerprint(executor);
+    if (!fingerprint.ok()) {
+      std::fprintf(stderr, "farpoint-worker: the self-test failed: %s\n",
+                   fingerprint.status().ToString().c_str());
+      return ExitCodeOf(fingerprint.status());
+    }
+    options.fingerprint = *fingerprint;
+  }
+  options.threads = flags.threads;
+  options.name = flags.name;
+  options.cached_scenes = flags.cached_scenes;
+  options.drain_time = std::chrono::seconds(flags.drain_seconds);
+  options.log = LogEntry;
+
+  const std::unique_ptr<GrpcLink> link = GrpcLink::Connect(flags.coordinator);
+  const absl::StatusOr<std::unique_ptr<BlobCache>> cache =
+      BlobCache::Open({.directory = flags.cache, .max_bytes = flags.cache_bytes}, *link);
+  if (!cache.ok()) {
+    std::fprintf(stderr, "farpoint-worker: --cache: %s\n", cache.status().ToString().c_str());
+    return ExitCodeOf(cache.status());
+  }
+  const std::unique_ptr<TileRenderer> renderer = MakeCoreRenderer();
+  Worker worker(std::move(options), *link, **cache, *renderer);
+  spdlog::info("farpoint-worker {} for {}, cache '{}'", FARPOINT_VERSION, flags.coordinator,
+               flags.cache);
+
+  std::atomic<bool> ended = false;
+  std::thread stopper([&] {
+    const timespec slice{.tv_sec = 0, .tv_nsec = 100'000'000};
+    while (!ended.load()) {
+      if (::sigtimedwait(&signals, nullptr, &slice) <= 0) continue;
+      spdlog::info("stopping: the tile in work is finished or given back");
+      worker.Stop();
+    }
+  });
+  const absl::Status status = worker.Run();
+  ended = true;
+  stopper.join();
+  if (!status.ok()) {
+    std::fprintf(stderr, "farpoint-worker: %s\n", status.ToString().c_str());
+    return ExitCodeOf(status);
+  }
+  spdlog::info("stopped");
+  return 0;
+}
+
+}  // namespace
+}  // namespace farpoint
+
+int main(int argc, char** argv) { return farpoint::Main(argc, argv); }

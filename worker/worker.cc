@@ -1,0 +1,232 @@
+#include "worker/worker.h"
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <random>
+#include <thread>
+
+#include "core/base/executor.h"
+#include "worker/tile_runner.h"
+
+namespace farpoint {
+
+namespace {
+
+using std::chrono::steady_clock;
+
+bool TryAgain(const absl::Status& status) {
+  return absl::IsUnavailable(status) || absl::IsDeadlineExceeded(status) ||
+         absl::IsResourceExhausted(status) || absl::IsAborted(status);
+}
+
+}  // namespace
+
+struct Worker::Impl {
+  Impl(WorkerOptions options, CoordinatorLink& link, BlobSource& blobs,
+       const TileRenderer& renderer)
+      : options(std::move(options)),
+        link(link),
+        executor(this->options.threads),
+        runner(renderer, blobs, executor, this->options.cached_scenes),
+        jitter(std::random_device{}()) {}
+
+  absl::Status Run() {
+    while (!Stopping()) {
+      FP_RETURN_IF_ERROR(Register());
+      if (Stopping()) break;
+      WorkUntilUnknown();
+    }
+    if (!welcome.id.empty()) (void)link.Leave(welcome.id);  // it would find out by itself
+    return absl::OkStatus();
+  }
+
+  // Tries for ever, until it is stopped (OK) or refused.
+  absl::Status Register() {
+    WorkerHello hello;
+    hello.version = FARPOINT_VERSION;
+    hello.fingerprint = options.fingerprint;
+    hello.threads = executor.threads();
+    hello.name = options.name;
+    ResetBackoff();
+    while (!Stopping()) {
+      const absl::StatusOr<WorkerWelcome> answer = link.Register(hello);
+      if (answer.ok()) {
+        welcome = *answer;
+        Log(WorkerLogEntry::Level::kInfo, "registered as " + welcome.id.value);
+        return absl::OkStatus();
+      }
+      if (!TryAgain(answer.status())) return Annotate(answer.status(), "cannot register");
+      Log(WorkerLogEntry::Level::kWarning,
+          "cannot reach the coordinator, trying again: " + answer.status().ToString());
+      BackOff();
+    }
+    return absl::OkStatus();
+  }
+
+  // Returns when the coordinator does not know this worker any more, or to stop.
+  void WorkUntilUnknown() {
+    ResetBackoff();
+    while (!Stopping()) {
+      const absl::StatusOr<std::optional<TileWork>> work = link.Lease(welcome.id, welcome.max_wait);
+      if (work.ok()) {
+        ResetBackoff();
+        if (work->has_value() && !WorkOn(**work)) return;
+        continue;
+      }
+      if (absl::IsCancelled(work.status()) && Stopping()) return;
+      if (absl::IsNotFound(work.status())) {
+        Log(WorkerLogEntry::Level::kWarning,
+            "the coordinator does not know this worker, registering again");
+        return;
+      }
+      Log(WorkerLogEntry::Level::kWarning, "no lease, trying again: " + work.status().ToString());
+      BackOff();
+    }
+  }
+
+  // One tile from lease to result. False if the coordinator does not know this worker any more.
+  bool WorkOn(const TileWork& work) {
+    TileProgress progress;
+    std::atomic<bool> cancel = false;
+    bool known = true;      // by the coordinator; both written by the heartbeat, read after join
+    std::string dropped;    // why the coordinator dropped the tile
+    bool finished = false;  // guarded by mutex
+    std::thread heartbeat([&] {
+      std::unique_lock lock(mutex);
+      auto next = steady_clock::now() + welcome.heartbeat;
+      while (!finished) {
+        // A stop with time to drain changes nothing until that is over.
+        auto until = next;
+        if (stop_at) until = std::min(until, *stop_at + options.drain_time);
+        changed.wait_until(lock, until, [&] {
+          return finished || (stop_at && steady_clock::now() >= *stop_at + options.drain_time);
+        });
+        if (finished) return;
+        if (stop_at && steady_clock::now() >= *stop_at + options.drain_time) {
+          cancel = true;
+          // Heartbeats go on until the tile is given back; nothing else is waited for.
+          changed.wait_until(lock, next, [&] { return finished; });
+          if (finished) return;
+        }
+        if (steady_clock::now() < next) continue;
+        lock.unlock();
+        const absl::StatusOr<RenewAnswer> answer =
+            link.Renew(welcome.id, work.lease, {progress.counter.load(), progress.fraction.load()});
+        lock.lock();
+        next = steady_clock::now() + welcome.heartbeat;
+        if (answer.ok() && answer->drop) {
+          dropped = answer->reason;
+          cancel = true;
+        } else if (absl::IsNotFound(answer.status())) {
+          known = false;
+          cancel = true;
+        }
+        // Cannot be reached now: it may be back before the lease is lost.
+      }
+    });
+
+    const absl::StatusOr<TileResult> result = runner.Run(work, progress, cancel);
+    absl::StatusOr<ReturnAnswer> answer = absl::UnknownError("not returned");
+    if (result.ok() && !cancel.load()) {
+      ResetBackoff();
+      for (;;) {
+        answer = link.Return(welcome.id, *result);
+        progress.Advance();
+        if (answer.ok() || !TryAgain(answer.status()) || cancel.load()) break;
+        LogTile(WorkerLogEntry::Level::kWarning,
+                "result not delivered, trying again: " + answer.status().ToString(), work);
+        BackOff();
+      }
+    }
+    {
+      std::lock_guard lock(mutex);
+      finished = true;
+    }
+    changed.notify_all();
+    heartbeat.join();
+
+    if (!known) return false;
+    if (!dropped.empty()) {
+      LogTile(WorkerLogEntry::Level::kInfo, "dropped: " + dropped, work);
+      return true;
+    }
+    if (result.ok() && answer.ok()) {
+      LogTile(answer->accepted ? WorkerLogEntry::Level::kInfo : WorkerLogEntry::Level::kWarning,
+              answer->accepted ? "returned" : "result refused: " + answer->reason, work);
+      return true;
+    }
+    if (cancel.load()) {
+      const absl::Status given = link.ReportFailure(welcome.id, work.lease, true, absl::OkStatus());
+      LogTile(WorkerLogEntry::Level::kInfo, "given back: " + given.ToString(), work);
+      return !absl::IsNotFound(given);
+    }
+    const absl::Status error = result.ok() ? answer.status() : result.status();
+    if (absl::IsNotFound(error) && result.ok()) return false;
+    LogTile(WorkerLogEntry::Level::kError, "failed: " + error.ToString(), work);
+    const absl::Status reported = link.ReportFailure(welcome.id, work.lease, false, error);
+    if (!reported.ok()) {
+      LogTile(WorkerLogEntry::Level::kWarning, "failure not reported: " + reported.ToString(),
+              work);
+    }
+    return !absl::IsNotFound(reported);
+  }
+
+  void Stop() {
+    {
+      std::lock_guard lock(mutex);
+      if (!stop_at) stop_at = steady_clock::now();
+    }
+    link.CancelWaits();
+    changed.notify_all();
+  }
+
+  bool Stopping() {
+    std::lock_guard lock(mutex);
+    return stop_at.has_value();
+  }
+
+  void ResetBackoff() { backoff = options.first_backoff; }
+  // Waits, but for Stop().
+  void BackOff() {
+    std::uniform_real_distribution<double> factor(0.5, 1.5);
+    const auto wait = std::chrono::duration_cast<steady_clock::duration>(backoff * factor(jitter));
+    backoff = std::min(backoff * 2, options.last_backoff);
+    std::unique_lock lock(mutex);
+    changed.wait_for(lock, wait, [this] { return stop_at.has_value(); });
+  }
+
+  void Log(WorkerLogEntry::Level level, std::string text) const {
+    if (options.log) options.log({.level = level, .text = std::move(text)});
+  }
+  void LogTile(WorkerLogEntry::Level level, std::string text, const TileWork& work) const {
+    if (!options.log) return;
+    options.log({.level = level,
+                 .text = std::move(text),
+                 .job = work.job,
+                 .tile = work.tile,
+                 .attempt = work.attempt});
+  }
+
+  const WorkerOptions options;
+  CoordinatorLink& link;
+  Executor executor;
+  TileRunner runner;
+  WorkerWelcome welcome;
+  std::mt19937 jitter;
+  std::chrono::milliseconds backoff{};
+
+  std::mutex mutex;
+  std::condition_variable changed;
+  std::optional<steady_clock::time_point> stop_at;  // guarded by mutex
+};
+
+Worker::Worker(WorkerOptions options, CoordinatorLink& link, BlobSource& blobs,
+               const TileRenderer& renderer)
+    : impl_(std::make_unique<Impl>(std::move(options), link, blobs, renderer)) {}
+Worker::~Worker() = default;
+absl::Status Worker::Run() { return impl_->Run(); }
+void Worker::Stop() { impl_->Stop(); }
+
+}  // namespace farpoint
