@@ -19,35 +19,66 @@ constexpr size_t kMaxConfigBytes = 1 << 20;
 
 absl::Status Bad(std::string text) { return absl::InvalidArgumentError(text); }
 
+// "  names    help", the help wrapped to the right of its column.
+std::string HelpEntry(const std::string& names, std::string_view help) {
+  constexpr size_t kColumn = 28, kWidth = 100;
+  std::string text = "  " + names;
+  text += names.size() + 4 > kColumn ? "\n" + std::string(kColumn, ' ')
+                                     : std::string(kColumn - 2 - names.size(), ' ');
+  size_t at = kColumn;
+  while (!help.empty()) {
+    const std::string_view word = help.substr(0, help.find(' '));
+    if (at + word.size() > kWidth && at > kColumn) {
+      text.back() = '\n';
+      text.append(kColumn, ' ');
+      at = kColumn;
+    }
+    text.append(word).append(" ");
+    at += word.size() + 1;
+    help.remove_prefix(std::min(help.size(), word.size() + 1));
+  }
+  text.back() = '\n';
+  return text;
+}
+
 // Declares the options of one verb and remembers where their values go. Values arrive as text and
 // are checked here, so that every message has the same form.
 class Options {
  public:
   explicit Options(CLI::App& app) : app_(app) {
-    // "--help" is printed by us, after the whole line was read.
+    // Help is printed by us, after the whole line was read.
     app_.set_help_flag();
     app_.allow_extras();
-    app_.add_flag("-h,--help", help_, "print this help");
+    app_.add_flag("-h,--help", help_);
     names_.push_back("--help");
+    entries_.push_back({"General", "-h, --help", "print this help"});
   }
 
   void Text(const std::string& names, const std::string& metavar, std::string& target,
-            const std::string& help, const std::string& group = "Options") {
-    CLI::Option* option = app_.add_option(names, target, help);
-    option->type_name(metavar)->group(group)->take_last();
-    names_.push_back(LongName(option));
+            const std::string& help, const std::string& group) {
+    CLI::Option* option = app_.add_option(names, target);
+    option->take_last();
+    names_.push_back("--" + option->get_lnames().front());
+    const size_t comma = names.find(',');
+    entries_.push_back({group,
+                        (comma == std::string::npos
+                             ? names
+                             : names.substr(0, comma) + ", " + names.substr(comma + 1)) +
+                            " " + metavar,
+                        help});
   }
 
   void Flag(const std::string& name, bool& target, const std::string& help,
-            const std::string& group = "Options") {
-    app_.add_flag(name, target, help)->group(group);
+            const std::string& group) {
+    app_.add_flag(name, target);
     names_.push_back(name);
     switches_.push_back(name);
+    entries_.push_back({group, name, help});
   }
 
   template <typename T>
   void Number(const std::string& name, const std::string& metavar, std::optional<T>& target, T min,
-              T max, const std::string& help, const std::string& group = "Options") {
+              T max, const std::string& help, const std::string& group) {
     std::string& text = texts_.emplace_back();
     Text(name, metavar, text, help, group);
     CLI::Option* option = app_.get_option(name);
@@ -69,7 +100,8 @@ class Options {
   }
 
   void Positional(const std::string& name, std::string& target, const std::string& help) {
-    app_.add_option(name, target, help)->type_name("")->take_last();
+    app_.add_option(name, target);
+    entries_.push_back({"", name, help});
   }
 
   void Render(std::vector<GivenFlag>& given) {
@@ -79,14 +111,14 @@ class Options {
       CLI::Option* option = nullptr;
       std::vector<std::string>& values = value_lists_.emplace_back();
       if (flag.metavar.empty()) {
-        const std::string help(flag.help);
-        option = app_.add_flag(name, help);
+        option = app_.add_flag(name);
         switches_.push_back(name);
       } else {
-        option = app_.add_option(name, values, std::string(flag.help));
-        option->type_name(std::string(flag.metavar))->allow_extra_args(false);
+        option = app_.add_option(name, values)->allow_extra_args(false);
       }
-      option->group(std::string(flag.group));
+      entries_.push_back({std::string(flag.group),
+                          name + (flag.metavar.empty() ? "" : " ") + std::string(flag.metavar),
+                          std::string(flag.help)});
       const bool repeatable = flag.repeatable;
       checks_.push_back([=, &values, &given]() -> absl::Status {
         if (option->count() == 0) return absl::OkStatus();
@@ -134,15 +166,36 @@ class Options {
     return std::find(switches_.begin(), switches_.end(), name) != switches_.end();
   }
   bool help_wanted() const { return help_; }
+  // Groups in the order in which they were declared, "General" last.
+  std::string Help(const std::string& summary) const {
+    std::string usage = "farpoint " + app_.get_name(), text;
+    std::vector<std::string> groups;
+    for (const Entry& entry : entries_) {
+      if (entry.group.empty()) usage += " " + entry.names;
+      if (std::find(groups.begin(), groups.end(), entry.group) == groups.end()) {
+        groups.push_back(entry.group);
+      }
+    }
+    std::stable_partition(groups.begin(), groups.end(),
+                          [](const std::string& group) { return group != "General"; });
+    for (const std::string& group : groups) {
+      text += "\n" + (group.empty() ? "" : group + ":\n");
+      for (const Entry& entry : entries_) {
+        if (entry.group == group) text += HelpEntry(entry.names, entry.help);
+      }
+    }
+    return usage + " [flags]\n" + summary + "\n" + text;
+  }
   CLI::App& app() { return app_; }
 
  private:
-  static std::string LongName(const CLI::Option* option) {
-    return "--" + option->get_lnames().front();
-  }
+  struct Entry {
+    std::string group, names, help;
+  };
 
   CLI::App& app_;
   bool help_ = false;
+  std::vector<Entry> entries_;
   std::vector<std::string> names_, switches_;
   std::list<std::string> texts_;                     // stable addresses
   std::list<std::vector<std::string>> value_lists_;  // stable addresses
@@ -256,7 +309,7 @@ void Declare(Options& options, CommandLine& line, Parsed& parsed) {
                    "Comparison");
       options.Text("--ref-layer", "NAME", line.ref_layer,
                    "the reference's layer; default: the same", "Comparison");
-      options.Text("--mask", "FILE", line.mask, "only pixels that are not 0 in this .exr or .npy",
+      options.Text("--mask", "FILE", line.mask, "only pixels that are above 0.5 in this .exr or .npy",
                    "Comparison");
       options.Number<double>("--noise", "X", parsed.noise, 0, 1e6,
                              "relative RMSE of the reference itself, taken out of rr", "Comparison");
@@ -407,7 +460,6 @@ absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
     const std::string config = parsed.config;
     parsed = {};
     CLI::App app(verb->help, verb->name);
-    app.get_formatter()->column_width(32);
     Options options(app);
     Declare(options, line, parsed);
     if (reading == 1) {
@@ -416,7 +468,7 @@ absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
     }
     FP_RETURN_IF_ERROR(Split(options, all));
     if (options.help_wanted()) {
-      line.print = app.help("farpoint " + std::string(verb->name));
+      line.print = options.Help(verb->help);
       return line;
     }
     if (parsed.config.empty()) break;

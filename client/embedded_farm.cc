@@ -1,5 +1,6 @@
 #include "client/embedded_farm.h"
 
+#include <atomic>
 #include <chrono>
 #include <string>
 #include <thread>
@@ -39,7 +40,8 @@ class EmbeddedFarm final : public FarmLink {
     worker_options.threads = options.threads;
     // Within one process every worker computes alike.
     worker_options.fingerprint = HashBytes({});
-    worker_options.log = [&console](const WorkerLogEntry& entry) {
+    worker_options.log = [this, &console](const WorkerLogEntry& entry) {
+      if (ending_) return;  // what is cut off then is no news
       Show(console, entry.level == WorkerLogEntry::Level::kWarning,
            entry.level == WorkerLogEntry::Level::kError, entry.text);
     };
@@ -56,6 +58,7 @@ class EmbeddedFarm final : public FarmLink {
   }
 
   ~EmbeddedFarm() override {
+    ending_ = true;
     for (const auto& worker : workers_) worker->Stop();
     coordinator_->Drain();  // wakes workers that wait for a lease
     for (std::thread& thread : threads_) thread.join();
@@ -110,6 +113,7 @@ class EmbeddedFarm final : public FarmLink {
   }
 
  private:
+  std::atomic<bool> ending_{false};
   std::unique_ptr<Coordinator> coordinator_;
   InProcessLink<CoordinatorApi> link_;
   std::unique_ptr<TileRenderer> renderer_;
