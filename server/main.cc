@@ -40,6 +40,7 @@ int ExitCodeOf(const absl::Status& status) {
 void DefineFlags(CLI::App& app, ServerFlags& flags) {
   app.set_version_flag("--version", "farpoint-server " FARPOINT_VERSION);
   app.set_config("--config", "", "Flags from a file: one NAME=VALUE a line, without the dashes");
+  app.allow_config_extras(CLI::config_extras_mode::error);
   app.add_option("--listen", flags.listen, "HOST:PORT to listen on; port 0 takes a free one")
       ->capture_default_str();
   app.add_option("--store", flags.store, "Folder for jobs, blobs and tiles")->required();

@@ -59,6 +59,7 @@ int ExitCodeOf(const absl::Status& status) {
 void DefineFlags(CLI::App& app, WorkerFlags& flags) {
   app.set_version_flag("--version", "farpoint-worker " FARPOINT_VERSION);
   app.set_config("--config", "", "Flags from a file: one NAME=VALUE a line, without the dashes");
+  app.allow_config_extras(CLI::config_extras_mode::error);
   app.add_option("--coordinator", flags.coordinator, "HOST:PORT of farpoint-server")->required();
   app.add_option("--cache", flags.cache, "Folder for scenes; workers of one machine may share it")
       ->capture_default_str();

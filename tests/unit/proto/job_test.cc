@@ -1,0 +1,158 @@
+#include "proto/job.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+namespace farpoint {
+namespace {
+
+using ::testing::HasSubstr;
+
+JobSpec SmallJob() {
+  JobSpec job;
+  job.asset_root = "a.gltf";
+  job.asset_files["a.gltf"] = Sha256().Update("a").Finish();
+  job.film = {.width = 64, .height = 32, .crop = {0, 0, 64, 32}};
+  return job;
+}
+
+TEST(Job, ACompleteJobIsValid) { EXPECT_TRUE(ValidateJob(SmallJob()).ok()); }
+
+TEST(Job, WhatIsMissingIsNamed) {
+  JobSpec job = SmallJob();
+  job.film = {};
+  EXPECT_THAT(std::string(ValidateJob(job).message()), HasSubstr("film"));
+  job = SmallJob();
+  job.asset_root.clear();
+  EXPECT_THAT(std::string(ValidateJob(job).message()), HasSubstr("asset.root"));
+  job = SmallJob();
+  job.asset_files.clear();
+  EXPECT_THAT(std::string(ValidateJob(job).message()), HasSubstr("asset.files"));
+}
+
+TEST(Job, LimitsAreResourceExhausted) {
+  JobSpec job = SmallJob();
+  job.limits.max_pixels = 64 * 32 - 1;
+  EXPECT_TRUE(absl::IsResourceExhausted(ValidateJob(job)));
+  job = SmallJob();
+  job.settings.points = 1000;
+  job.limits.max_surfels = 999;
+  EXPECT_TRUE(absl::IsResourceExhausted(ValidateJob(job)));
+}
+
+TEST(Job, TheSmallerLimitWins) {
+  JobLimits a, b;
+  a.max_pixels = 5;
+  b.max_triangles = 6;
+  b.max_pixels = 7;
+  const JobLimits c = Smaller(a, b);
+  EXPECT_EQ(c.max_pixels, 5u);
+  EXPECT_EQ(c.max_triangles, 6u);
+  EXPECT_EQ(c.max_surfels, JobLimits().max_surfels);
+}
+
+TEST(Job, CamerasAreFoundByNameOrMadeOfAView) {
+  Scene scene;
+  scene.cameras.resize(2);
+  scene.cameras[0].name = "front";
+  scene.cameras[1].name = "back";
+  EXPECT_EQ(ResolveCamera({}, scene)->name, "front");
+  EXPECT_EQ(ResolveCamera(CameraName{"back"}, scene)->name, "back");
+  const auto unknown = ResolveCamera(CameraName{"side"}, scene);
+  EXPECT_TRUE(absl::IsNotFound(unknown.status()));
+  EXPECT_THAT(std::string(unknown.status().message()), HasSubstr("'front', 'back'"));
+
+  const auto made = ResolveCamera(
+      LookAt{.eye = {1, 1, 1}, .target = {1, 1, -9}, .up = {0, 5, 3}, .yfov_deg = 90}, scene);
+  ASSERT_TRUE(made.ok());
+  EXPECT_NEAR(made->yfov_rad, 1.5707963267948966, 1e-15);
+  EXPECT_EQ(made->forward, Vec3d(0, 0, -1));
+  EXPECT_NEAR(Length(made->right - Vec3d(1, 0, 0)), 0, 1e-15);
+  EXPECT_NEAR(Length(made->up - Vec3d(0, 1, 0)), 0, 1e-15);
+}
+
+TEST(Job, ViewsWithoutDirectionAreRefused) {
+  const Scene scene;
+  EXPECT_TRUE(absl::IsInvalidArgument(
+      ResolveCamera(LookAt{.eye = {1, 1, 1}, .target = {1, 1, 1}}, scene).status()));
+  EXPECT_TRUE(absl::IsInvalidArgument(
+      ResolveCamera(LookAt{.eye = {0, 0, 0}, .target = {0, 7, 0}}, scene).status()));
+  EXPECT_TRUE(absl::IsNotFound(ResolveCamera({}, scene).status()));
+}
+
+TEST(Job, OverridesReplaceLightSkyAndAlbedo) {
+  Scene scene;
+  scene.lights.resize(3);
+  scene.materials.resize(2);
+  scene.materials[0].base_color_texture.texture = 0;
+  scene.materials[1].base_color_texture.texture = 0;
+  scene.materials[1].alpha_mode = AlphaMode::kMask;
+  scene.meshes.resize(2);
+  scene.meshes[0].material = 0;
+  scene.meshes[1].material = -1;
+  SceneOverrides overrides;
+  overrides.suns = {{.to_sun = {0, 2, 0}, .irradiance = {1, 2, 3}}};
+  overrides.sky = Rgb(4, 5, 6);
+  overrides.albedo = Rgb(0.25f, 0.5f, 0.75f);
+  ApplyOverrides(overrides, scene);
+  ASSERT_EQ(scene.lights.size(), 1u);
+  EXPECT_EQ(scene.lights[0].kind, PunctualKind::kDirectional);
+  EXPECT_EQ(scene.lights[0].direction, Vec3d(-0.0, -1, -0.0));
+  EXPECT_EQ(scene.lights[0].intensity, Rgb(1, 2, 3));
+  EXPECT_EQ(scene.environment.sky, Rgb(4, 5, 6));
+  ASSERT_EQ(scene.materials.size(), 3u);
+  EXPECT_EQ(scene.meshes[1].material, 2);
+  for (const Material& m : scene.materials) EXPECT_EQ(m.base_color, Rgb(0.25f, 0.5f, 0.75f));
+  EXPECT_FALSE(scene.materials[0].base_color_texture.present());
+  EXPECT_TRUE(scene.materials[1].base_color_texture.present());  // its alpha is needed
+}
+
+TEST(Job, NoOverrideChangesNothing) {
+  Scene scene;
+  scene.lights.resize(3);
+  scene.meshes.resize(1);
+  ApplyOverrides({}, scene);
+  EXPECT_EQ(scene.lights.size(), 3u);
+  EXPECT_EQ(scene.meshes[0].material, -1);
+  EXPECT_TRUE(scene.materials.empty());
+}
+
+TEST(Job, MatricesProjectTheFrameOntoTheUnitSquare) {
+  Camera camera;
+  camera.eye = {10, 20, 30};
+  camera.right = {0, 0, -1};
+  camera.up = {0, 1, 0};
+  camera.forward = {1, 0, 0};
+  camera.yfov_rad = 1.2;
+  const FilmSpec film{.width = 200, .height = 100, .crop = {0, 0, 200, 100}};
+  const CameraMatrices m = MatricesOf(camera, film);
+  const auto apply = [](const std::array<float, 16>& a, const Vec3d& p) {
+    std::array<double, 4> r{};
+    for (int c = 0; c < 4; ++c) r[c] = p.x * a[c] + p.y * a[4 + c] + p.z * a[8 + c] + a[12 + c];
+    return r;
+  };
+  // The upper right corner of the frame, 7 m away.
+  const double t = std::tan(0.6);
+  const Vec3d corner = camera.eye + (camera.forward + camera.up * t + camera.right * (2 * t)) * 7.0;
+  const auto ndc = apply(m.world_to_ndc, corner);
+  EXPECT_NEAR(ndc[0] / ndc[3], 1, 1e-5);
+  EXPECT_NEAR(ndc[1] / ndc[3], 1, 1e-5);
+  EXPECT_NEAR(ndc[3], 7, 1e-5);
+  const auto local = apply(m.world_to_camera, corner);
+  EXPECT_NEAR(local[0], 14 * t, 1e-5);
+  EXPECT_NEAR(local[1], 7 * t, 1e-5);
+  EXPECT_NEAR(local[2], -7, 1e-5);
+}
+
+TEST(Job, StatesHaveNamesAndAnEnd) {
+  EXPECT_EQ(NameOf(JobState::kRendering), "rendering");
+  EXPECT_FALSE(IsFinal(JobState::kRendering));
+  EXPECT_TRUE(IsFinal(JobState::kDone));
+  EXPECT_TRUE(IsFinal(JobState::kFailed));
+  EXPECT_TRUE(IsFinal(JobState::kCancelled));
+}
+
+}  // namespace
+}  // namespace farpoint
