@@ -60,12 +60,12 @@ class Options {
     option->take_last();
     names_.push_back("--" + option->get_lnames().front());
     const size_t comma = names.find(',');
-    entries_.push_back({group,
-                        (comma == std::string::npos
-                             ? names
-                             : names.substr(0, comma) + ", " + names.substr(comma + 1)) +
-                            " " + metavar,
-                        help});
+    entries_.push_back(
+        {group,
+         (comma == std::string::npos ? names
+                                     : names.substr(0, comma) + ", " + names.substr(comma + 1)) +
+             " " + metavar,
+         help});
   }
 
   void Flag(const std::string& name, bool& target, const std::string& help,
@@ -309,10 +309,11 @@ void Declare(Options& options, CommandLine& line, Parsed& parsed) {
                    "Comparison");
       options.Text("--ref-layer", "NAME", line.ref_layer,
                    "the reference's layer; default: the same", "Comparison");
-      options.Text("--mask", "FILE", line.mask, "only pixels that are above 0.5 in this .exr or .npy",
-                   "Comparison");
+      options.Text("--mask", "FILE", line.mask,
+                   "only pixels that are above 0.5 in this .exr or .npy", "Comparison");
       options.Number<double>("--noise", "X", parsed.noise, 0, 1e6,
-                             "relative RMSE of the reference itself, taken out of rr", "Comparison");
+                             "relative RMSE of the reference itself, taken out of rr",
+                             "Comparison");
       options.Text("--diff", "FILE.png", line.diff, "the absolute difference in false colour",
                    "Output");
       options.Text("--json", "FILE", line.json, "the measures; - for stdout", "Output");
@@ -384,9 +385,9 @@ absl::Status CheckCoordinator(const std::string& address) {
   const size_t colon = address.rfind(':');
   int port = 0;
   const char* end = address.data() + address.size();
-  const bool has_port =
-      colon != std::string::npos && colon > 0 &&
-      std::from_chars(address.data() + colon + 1, end, port).ptr == end && port > 0 && port < 65536;
+  const bool has_port = colon != std::string::npos && colon > 0 &&
+                        std::from_chars(address.data() + colon + 1, end, port).ptr == end &&
+                        port > 0 && port < 65536;
   if (!has_port) {
     return Bad("--coordinator " + address + ": expected HOST:PORT, e.g. farm.example:7420");
   }
@@ -412,7 +413,8 @@ absl::Status CheckNeeds(const CommandLine& line) {
     }
   }
   if (line.detach && !(line.output.empty() && line.png.empty() && line.json.empty())) {
-    return Bad("--detach: does not wait for an image; leave -o, --png and --json to farpoint fetch");
+    return Bad(
+        "--detach: does not wait for an image; leave -o, --png and --json to farpoint fetch");
   }
   if ((line.verb == Verb::kCancel || line.verb == Verb::kFetch) && line.job.empty()) {
     return Bad("JOB: not given; farpoint status lists the jobs");

@@ -28,8 +28,8 @@ struct CommandLine {
   // render, submit
   std::string scene;
   std::vector<GivenFlag> render_flags;
-  uint32_t workers = 1;  // render: embedded workers
-  uint32_t threads = 0;  // render: of each worker; 0: all cores
+  uint32_t workers = 1;       // render: embedded workers
+  uint32_t threads = 0;       // render: of each worker; 0: all cores
   bool farm_ignores = false;  // submit was given --workers or --threads
   bool detach = false;
   std::optional<std::string> title;

@@ -100,7 +100,7 @@ absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& cons
                       PrepareRequest(line.scene, line.render_flags, usage_error));
   FP_ASSIGN_OR_RETURN(
       const std::unique_ptr<FarmLink> farm,
-      StartEmbeddedFarm({.workers = line.workers, .threads = line.threads}, console));
+      StartEmbeddedFarm({.workers = line.workers, .threads = line.threads}, stop, console));
   // Nothing is between this and the coordinator: one attempt says all.
   Retry once({.patience = std::chrono::milliseconds(0)}, "the embedded coordinator", stop, console);
   JobRun run(*farm, once, stop, console);
@@ -123,7 +123,7 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
                       PrepareRequest(line.scene, line.render_flags, usage_error));
   if (line.title) request.spec.title = *line.title;
   if (line.priority) request.spec.priority = *line.priority;
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator);
+  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
   FP_ASSIGN_OR_RETURN(const JobId id, run.Submit(request));
@@ -142,7 +142,7 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
 absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& console) {
   const SteadyTime start = std::chrono::steady_clock::now();
   FP_RETURN_IF_ERROR(CheckOutputs(line));
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator);
+  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
   FP_ASSIGN_OR_RETURN(const FinishedJob job, run.Fetch(JobId{line.job}));
@@ -151,11 +151,10 @@ absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& conso
 
 absl::Status Status(const CommandLine& line, const StopFlag& stop, Console& console) {
   FP_RETURN_IF_ERROR(CheckOutputs(line));
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator);
+  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
-  FP_ASSIGN_OR_RETURN(const FarmStatus status, retry.Get<FarmStatus>([&] {
-                        return farm->Status(JobId{line.job});
-                      }));
+  FP_ASSIGN_OR_RETURN(const FarmStatus status,
+                      retry.Get<FarmStatus>([&] { return farm->Status(JobId{line.job}); }));
   if (line.json.empty()) return WriteText("-", FarmStatusText(status));
   if (line.job.empty()) return WriteText(line.json, FarmStatusJson(status));
   if (status.jobs.size() != 1) {
@@ -165,7 +164,7 @@ absl::Status Status(const CommandLine& line, const StopFlag& stop, Console& cons
 }
 
 absl::Status Cancel(const CommandLine& line, const StopFlag& stop, Console& console) {
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator);
+  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
   return retry.Run([&] { return farm->Cancel(JobId{line.job}); });
 }

@@ -32,8 +32,9 @@ void Show(Console& console, bool warning, bool error, std::string_view text) {
 class EmbeddedFarm final : public FarmLink {
  public:
   EmbeddedFarm(std::unique_ptr<Coordinator> coordinator, const EmbeddedFarmOptions& options,
-               Console& console)
-      : coordinator_(std::move(coordinator)),
+               const StopFlag& stop, Console& console)
+      : stop_(stop),
+        coordinator_(std::move(coordinator)),
         link_(*coordinator_),
         renderer_(MakeCoreRenderer()) {
     WorkerOptions worker_options;
@@ -86,7 +87,7 @@ class EmbeddedFarm final : public FarmLink {
   }
   absl::Status Cancel(const JobId& job) override { return coordinator_->Cancel(job); }
 
-  absl::Status Watch(const JobId& job, uint64_t after_sequence, const StopFlag& stop,
+  absl::Status Watch(const JobId& job, uint64_t after_sequence,
                      const std::function<void(const JobEvent&)>& on_event) override {
     while (true) {
       FP_ASSIGN_OR_RETURN(const std::vector<JobEvent> events,
@@ -96,7 +97,7 @@ class EmbeddedFarm final : public FarmLink {
         on_event(event);
         if (event.sequence > 0) after_sequence = event.sequence;
       }
-      if (stop.raised()) return absl::CancelledError("stopped by a signal");
+      if (stop_.raised()) return absl::CancelledError("stopped by a signal");
     }
   }
 
@@ -113,6 +114,7 @@ class EmbeddedFarm final : public FarmLink {
   }
 
  private:
+  const StopFlag& stop_;
   std::atomic<bool> ending_{false};
   std::unique_ptr<Coordinator> coordinator_;
   InProcessLink<CoordinatorApi> link_;
@@ -124,6 +126,7 @@ class EmbeddedFarm final : public FarmLink {
 }  // namespace
 
 absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOptions& options,
+                                                            const StopFlag& stop,
                                                             Console& console) {
   CoordinatorOptions coordinator_options;
   coordinator_options.baker = MakeCoreBaker(options.threads);
@@ -137,7 +140,7 @@ absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOp
   };
   FP_ASSIGN_OR_RETURN(std::unique_ptr<Coordinator> coordinator,
                       Coordinator::Open(std::move(coordinator_options)));
-  return std::make_unique<EmbeddedFarm>(std::move(coordinator), options, console);
+  return std::make_unique<EmbeddedFarm>(std::move(coordinator), options, stop, console);
 }
 
 }  // namespace farpoint

@@ -6,6 +6,7 @@
 
 #include "client/console.h"
 #include "client/farm_link.h"
+#include "client/stop_flag.h"
 #include "core/base/status.h"
 
 namespace farpoint {
@@ -15,8 +16,8 @@ struct EmbeddedFarmOptions {
   uint32_t threads = 0;  // of each worker and of the bake; 0: all cores
 };
 
-// Runs until it is destroyed; tiles in work are then dropped. `console` must outlive it.
+// Runs until it is destroyed; tiles in work are then dropped. `stop` and `console` must outlive it.
 absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOptions& options,
-                                                            Console& console);
+                                                            const StopFlag& stop, Console& console);
 
 }  // namespace farpoint

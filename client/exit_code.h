@@ -7,9 +7,9 @@ namespace farpoint {
 
 enum ExitCode : int {
   kExitOk = 0,
-  kExitUsage = 2,         // the command line is wrong
-  kExitPermanent = 42,    // the scene, the job or the settings are wrong: trying again is useless
-  kExitTryAgain = 75,     // a peer or a resource was missing: the same command may succeed later
+  kExitUsage = 2,          // the command line is wrong
+  kExitPermanent = 42,     // the scene, the job or the settings are wrong: trying again is useless
+  kExitTryAgain = 75,      // a peer or a resource was missing: the same command may succeed later
   kExitInterrupted = 130,  // SIGINT
   kExitTerminated = 143,   // SIGTERM
 };

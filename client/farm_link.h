@@ -1,8 +1,9 @@
-// What the client needs of a coordinator, whether over a socket (grpc_farm_link.h) or within the process
-// (embedded_farm.h). One call is one attempt; who calls decides about trying again.
+// What the client needs of a coordinator, whether over a socket (grpc_farm_link.h) or within the
+// process (embedded_farm.h). One call is one attempt; who calls decides about trying again.
 //
 // Errors: kUnavailable and kDeadlineExceeded mean that the coordinator was not reached (try again);
-// all others are its answer. Not thread-safe.
+// all others are its answer. A link is made with a StopFlag; when that is raised, calls that would
+// take long end with kCancelled. Not thread-safe.
 #pragma once
 
 #include <functional>
@@ -10,7 +11,6 @@
 #include <string>
 #include <vector>
 
-#include "client/stop_flag.h"
 #include "core/base/blob.h"
 #include "core/base/hash.h"
 #include "core/base/status.h"
@@ -38,9 +38,8 @@ class FarmLink {
   virtual absl::StatusOr<FarmStatus> Status(const JobId& job) = 0;
   virtual absl::Status Cancel(const JobId& job) = 0;
 
-  // Calls `on_event` with every event after `after_sequence`, in order, until the job has ended
-  // (OK) or `stop` is raised (kCancelled).
-  virtual absl::Status Watch(const JobId& job, uint64_t after_sequence, const StopFlag& stop,
+  // Calls `on_event` with every event after `after_sequence`, in order, until the job has ended.
+  virtual absl::Status Watch(const JobId& job, uint64_t after_sequence,
                              const std::function<void(const JobEvent&)>& on_event) = 0;
 
   virtual absl::StatusOr<JobInfo> Info(const JobId& job) = 0;

@@ -3,8 +3,9 @@
 #include <grpcpp/grpcpp.h>
 
 #include <algorithm>
-#include <atomic>
 #include <chrono>
+#include <condition_variable>
+#include <mutex>
 #include <thread>
 #include <utility>
 
@@ -41,52 +42,57 @@ grpc::ChannelArguments ChannelArguments() {
   return arguments;
 }
 
-void SetDeadline(grpc::ClientContext& context, seconds time) {
-  context.set_deadline(std::chrono::system_clock::now() + time);
-}
-
 absl::Status Damaged(std::string text) {
   return absl::UnavailableError("the coordinator's answer is damaged: " + std::move(text));
 }
 
-// Cancels a call when the flag is raised. The context must outlive this.
-class CancelOnStop {
+// The context of one call, with its deadline, cancelled when the flag is raised.
+class Call {
  public:
-  CancelOnStop(grpc::ClientContext& context, const StopFlag& stop)
-      : thread_([this, &context, &stop] {
-          while (!ended_.load()) {
-            if (stop.raised()) {
-              context.TryCancel();
-              return;
-            }
-            std::this_thread::sleep_for(milliseconds(20));
-          }
-        }) {}
-  ~CancelOnStop() {
-    ended_ = true;
-    thread_.join();
+  Call(seconds time, const StopFlag& stop) {
+    context_.set_deadline(std::chrono::system_clock::now() + time);
+    // A signal handler can wake nobody, so this looks at the flag now and then.
+    watcher_ = std::thread([this, &stop] {
+      std::unique_lock lock(mutex_);
+      while (!ended_) {
+        if (stop.raised()) return context_.TryCancel();
+        wake_.wait_for(lock, milliseconds(20));
+      }
+    });
   }
+  ~Call() {
+    {
+      std::lock_guard lock(mutex_);
+      ended_ = true;
+    }
+    wake_.notify_one();
+    watcher_.join();
+  }
+  grpc::ClientContext* context() { return &context_; }
 
  private:
-  std::atomic<bool> ended_{false};
-  std::thread thread_;
+  grpc::ClientContext context_;
+  std::mutex mutex_;
+  std::condition_variable wake_;
+  bool ended_ = false;  // guarded by mutex_
+  std::thread watcher_;
 };
 
 class GrpcFarmLink final : public FarmLink {
  public:
-  explicit GrpcFarmLink(const std::string& address)
-      : channel_(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(),
+  GrpcFarmLink(const std::string& address, const StopFlag& stop)
+      : stop_(stop),
+        channel_(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(),
                                            ChannelArguments())),
         jobs_(v1::JobService::NewStub(channel_)),
         blobs_(v1::BlobService::NewStub(channel_)) {}
 
   absl::StatusOr<std::vector<Digest>> FindMissing(std::span<const Digest> blobs) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kControlDeadline);
+    Call call(kControlDeadline, stop_);
     v1::FindMissingRequest request;
     for (const Digest& digest : blobs) request.add_sha256(ToWire(digest));
     v1::FindMissingResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(blobs_->FindMissing(&context, request, &response)));
+    FP_RETURN_IF_ERROR(FromGrpc(blobs_->FindMissing(call.context(), request, &response)));
     std::vector<Digest> missing;
     for (const std::string& hex : response.sha256()) {
       FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(hex, "sha256"));
@@ -96,10 +102,9 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Put(const Digest& digest, const Blob& blob) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kBulkDeadline + seconds(blob.size() / kSlowestBytesPerSecond));
+    Call call(kBulkDeadline + seconds(blob.size() / kSlowestBytesPerSecond), stop_);
     v1::PutBlobResponse response;
-    const auto writer = blobs_->Put(&context, &response);
+    const auto writer = blobs_->Put(call.context(), &response);
     v1::PutBlobChunk chunk;
     chunk.set_sha256(ToWire(digest));
     chunk.set_size_bytes(blob.size());
@@ -118,24 +123,22 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kControlDeadline);
+    Call call(kControlDeadline, stop_);
     v1::SubmitRequest request;
     request.set_protocol_version(kProtocolVersion);
     *request.mutable_job() = ToWire(spec);
     request.set_submission_id(submission_id);
     v1::SubmitResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Submit(&context, request, &response)));
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Submit(call.context(), request, &response)));
     return JobId{response.job_id()};
   }
 
   absl::StatusOr<FarmStatus> Status(const JobId& job) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kControlDeadline);
+    Call call(kControlDeadline, stop_);
     v1::StatusRequest request;
     request.set_job_id(job.value);
     v1::StatusResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Status(&context, request, &response)));
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Status(call.context(), request, &response)));
     FarmStatus status;
     for (const v1::JobStatus& wire : response.jobs()) {
       FP_ASSIGN_OR_RETURN(JobStatus one, JobStatusFromWire(wire));
@@ -149,28 +152,25 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Cancel(const JobId& job) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kControlDeadline);
+    Call call(kControlDeadline, stop_);
     v1::CancelRequest request;
     request.set_job_id(job.value);
     v1::CancelResponse response;
-    return FromGrpc(jobs_->Cancel(&context, request, &response));
+    return FromGrpc(jobs_->Cancel(call.context(), request, &response));
   }
 
-  absl::Status Watch(const JobId& job, uint64_t after_sequence, const StopFlag& stop,
+  absl::Status Watch(const JobId& job, uint64_t after_sequence,
                      const std::function<void(const JobEvent&)>& on_event) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kWatchDeadline);
+    Call call(kWatchDeadline, stop_);
     v1::WatchRequest request;
     request.set_job_id(job.value);
     request.set_after_sequence(after_sequence);
-    const auto reader = jobs_->Watch(&context, request);
-    const CancelOnStop cancel(context, stop);
+    const auto reader = jobs_->Watch(call.context(), request);
     v1::JobEvent wire;
     while (reader->Read(&wire)) {
       const absl::StatusOr<JobEvent> event = JobEventFromWire(wire);
       if (!event.ok()) {
-        context.TryCancel();
+        call.context()->TryCancel();
         while (reader->Read(&wire)) {
         }
         reader->Finish().ok();
@@ -182,26 +182,24 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<JobInfo> Info(const JobId& job) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kInfoDeadline);
+    Call call(kInfoDeadline, stop_);
     v1::FetchInfoRequest request;
     request.set_job_id(job.value);
     v1::FetchInfoResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->FetchInfo(&context, request, &response)));
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->FetchInfo(call.context(), request, &response)));
     return JobInfoFromWire(response);
   }
 
   absl::Status FetchTiles(const JobId& job, std::span<const uint32_t> tiles,
                           const std::function<absl::Status(TileData)>& on_tile) override {
-    grpc::ClientContext context;
-    SetDeadline(context, kBulkDeadline * std::max<size_t>(1, tiles.size()));
+    Call call(kBulkDeadline * std::max<size_t>(1, tiles.size()), stop_);
     v1::FetchTilesRequest request;
     request.set_job_id(job.value);
     for (const uint32_t tile : tiles) request.add_tiles(tile);
-    const auto reader = jobs_->FetchTiles(&context, request);
+    const auto reader = jobs_->FetchTiles(call.context(), request);
     const absl::Status read = ReadTiles(*reader, on_tile);
     if (!read.ok()) {
-      context.TryCancel();
+      call.context()->TryCancel();
       v1::TileChunk rest;
       while (reader->Read(&rest)) {
       }
@@ -250,6 +248,7 @@ class GrpcFarmLink final : public FarmLink {
     return absl::OkStatus();
   }
 
+  const StopFlag& stop_;
   std::shared_ptr<grpc::Channel> channel_;
   std::unique_ptr<v1::JobService::Stub> jobs_;
   std::unique_ptr<v1::BlobService::Stub> blobs_;
@@ -257,8 +256,8 @@ class GrpcFarmLink final : public FarmLink {
 
 }  // namespace
 
-std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address) {
-  return std::make_unique<GrpcFarmLink>(address);
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop) {
+  return std::make_unique<GrpcFarmLink>(address, stop);
 }
 
 }  // namespace farpoint

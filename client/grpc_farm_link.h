@@ -6,10 +6,11 @@
 #include <string>
 
 #include "client/farm_link.h"
+#include "client/stop_flag.h"
 
 namespace farpoint {
 
-// `address` is HOST:PORT.
-std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address);
+// `address` is HOST:PORT. `stop` must outlive the link.
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop);
 
 }  // namespace farpoint

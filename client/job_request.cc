@@ -21,18 +21,20 @@ absl::StatusOr<JobFile> ReadJobFile(const std::string& path) {
   const std::string_view text(reinterpret_cast<const char*>(blob.bytes().data()), blob.size());
   FP_ASSIGN_OR_RETURN(const v1::RenderJob wire, RenderJobFromJson(text, path));
   if (wire.asset().root().empty()) {
-    return absl::InvalidArgumentError(path + ": asset.root: not given; name the scene's file, "
-                                             "relative to the job file");
+    return absl::InvalidArgumentError(path +
+                                      ": asset.root: not given; name the scene's file, "
+                                      "relative to the job file");
   }
   if (wire.asset().files_size() > 0) {
-    return absl::InvalidArgumentError(path + ": asset.files: is found by farpoint itself; leave "
-                                             "it out of the job file");
+    return absl::InvalidArgumentError(path +
+                                      ": asset.files: is found by farpoint itself; leave "
+                                      "it out of the job file");
   }
   const std::filesystem::path root(wire.asset().root());
   JobFile file;
-  file.asset_path =
-      root.is_absolute() ? root.string()
-                         : (std::filesystem::path(path).parent_path() / root).string();
+  file.asset_path = root.is_absolute()
+                        ? root.string()
+                        : (std::filesystem::path(path).parent_path() / root).string();
   if (IsJobFile(file.asset_path)) {
     return absl::InvalidArgumentError(path + ": asset.root: " + wire.asset().root() +
                                       " is a job file; name a .gltf or .glb");

@@ -49,9 +49,9 @@ absl::Status OutcomeOf(const JobStatus& status) {
       return absl::CancelledError("job " + status.id.value +
                                   " was cancelled; submit it again to render it");
     default:
-      return absl::FailedPreconditionError(
-          "job " + status.id.value + " is not done, it is " + std::string(NameOf(status.state)) +
-          "; wait for it, farpoint status shows how far it is");
+      return absl::FailedPreconditionError("job " + status.id.value + " is not done, it is " +
+                                           std::string(NameOf(status.state)) +
+                                           "; wait for it, farpoint status shows how far it is");
   }
 }
 
@@ -67,8 +67,9 @@ absl::StatusOr<JobId> JobRun::Submit(const PreparedRequest& request) {
   for (size_t first = 0; first < all.size(); first += kDigestsPerQuestion) {
     const size_t count = std::min(kDigestsPerQuestion, all.size() - first);
     const std::span<const Digest> question(all.data() + first, count);
-    FP_ASSIGN_OR_RETURN(const std::vector<Digest> missing,
-                        retry_.Get<std::vector<Digest>>([&] { return link_.FindMissing(question); }));
+    FP_ASSIGN_OR_RETURN(const std::vector<Digest> missing, retry_.Get<std::vector<Digest>>([&] {
+      return link_.FindMissing(question);
+    }));
     for (const Digest& digest : missing) {
       const auto blob = blobs.find(digest);
       if (blob == blobs.end()) {
@@ -92,7 +93,7 @@ absl::Status JobRun::Wait(const JobId& job) {
   uint64_t last_sequence = 0;
   JobStatus last;
   FP_RETURN_IF_ERROR(retry_.Run([&] {
-    return link_.Watch(job, last_sequence, stop_, [&](const JobEvent& event) {
+    return link_.Watch(job, last_sequence, [&](const JobEvent& event) {
       retry_.Succeeded();
       if (event.sequence > 0) last_sequence = event.sequence;
       last = event.status;

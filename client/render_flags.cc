@@ -291,7 +291,8 @@ constexpr RenderFlag kRenderFlags[] = {
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.points);
      }},
-    {"--microbuffer", "N", kMethod, "side of the microbuffer in pixels, 1..256; default 0: the map's",
+    {"--microbuffer", "N", kMethod,
+     "side of the microbuffer in pixels, 1..256; default 0: the map's",
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.microbuffer);
      }},
@@ -307,15 +308,16 @@ constexpr RenderFlag kRenderFlags[] = {
      "coverage (a node covers as much of a pixel as its solid angle, the default) or opaque (the "
      "nearest wins)",
      [](std::string_view value, JobEdit& edit) {
-       return ParseChoice(
-           value, {Choice<Splat>{"coverage", Splat::kCoverage}, {"opaque", Splat::kOpaque}},
-           edit.spec.settings.splat);
+       return ParseChoice(value,
+                          {Choice<Splat>{"coverage", Splat::kCoverage}, {"opaque", Splat::kOpaque}},
+                          edit.spec.settings.splat);
      }},
     {"--clusters", "N", kMethod, "fpbgi: clusters per block, 1..1024", ApplyClusters},
     {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.1",
      [](std::string_view value, JobEdit& edit) {
        double epsilon = 0;
-       if (!ParseFinite(value, epsilon) || epsilon < 0 || epsilon > std::numeric_limits<float>::max()) {
+       if (!ParseFinite(value, epsilon) || epsilon < 0 ||
+           epsilon > std::numeric_limits<float>::max()) {
          return Bad("expected a finite number of at least 0");
        }
        edit.spec.settings.epsilon = static_cast<float>(epsilon);
@@ -340,14 +342,16 @@ constexpr RenderFlag kRenderFlags[] = {
      "a sun in place of the scene's punctual lights: the direction from the scene to it, its "
      "irradiance on a facing surface in W/m²; may be repeated",
      ApplySun, /*repeatable=*/true},
-    {"--sky", "r,g,b", kLights, "a constant sky of this radiance in W/(m² sr); replaces the scene's",
+    {"--sky", "r,g,b", kLights,
+     "a constant sky of this radiance in W/(m² sr); replaces the scene's",
      [](std::string_view value, JobEdit& edit) {
        Rgb sky;
        FP_RETURN_IF_ERROR(ParseColor(value, kMaxRadiance, sky));
        edit.spec.overrides.sky = sky;
        return absl::OkStatus();
      }},
-    {"--albedo", "r,g,b", kLights, "replaces every material's base colour and its texture, each in [0, 1]",
+    {"--albedo", "r,g,b", kLights,
+     "replaces every material's base colour and its texture, each in [0, 1]",
      [](std::string_view value, JobEdit& edit) {
        Rgb albedo;
        FP_RETURN_IF_ERROR(ParseColor(value, 1, albedo));
@@ -358,10 +362,10 @@ constexpr RenderFlag kRenderFlags[] = {
      "photometric (glTF's lux and candela are divided by 683 lm/W, the default) or raw (taken as "
      "W/m² and W/sr)",
      [](std::string_view value, JobEdit& edit) {
-       return ParseChoice(value,
-                          {Choice<LightUnits>{"photometric", LightUnits::kPhotometric},
-                           {"raw", LightUnits::kRaw}},
-                          edit.spec.light_units);
+       return ParseChoice(
+           value,
+           {Choice<LightUnits>{"photometric", LightUnits::kPhotometric}, {"raw", LightUnits::kRaw}},
+           edit.spec.light_units);
      }},
     {"--tile", "N", kSpeed, "side of a tile in pixels, a multiple of 32; default 128",
      [](std::string_view value, JobEdit& edit) {
@@ -375,8 +379,9 @@ constexpr RenderFlag kRenderFlags[] = {
 };
 
 constexpr RefusedFlag kRefusedFlags[] = {
-    {"--fill", "filling cluster buffers by rays is not built yet; leave the flag out: the tree's "
-               "cut fills them"},
+    {"--fill",
+     "filling cluster buffers by rays is not built yet; leave the flag out: the tree's "
+     "cut fills them"},
     {"--quality", "quality levels are not built yet; set --points, --clusters and --microbuffer"},
     {"--env", "environment maps are not built yet; use --sky r,g,b for a constant sky"},
 };

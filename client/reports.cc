@@ -49,14 +49,10 @@ Json ToJson(const JobStatus& status) {
 }
 
 Json ToJson(const WorkerStatus& worker) {
-  return {{"id", worker.id.value},
-          {"name", worker.name},
-          {"version", worker.version},
-          {"threads", worker.threads},
-          {"leases", worker.leases},
-          {"committed", worker.committed},
-          {"failures", worker.failures},
-          {"set_aside", worker.set_aside},
+  return {{"id", worker.id.value},       {"name", worker.name},
+          {"version", worker.version},   {"threads", worker.threads},
+          {"leases", worker.leases},     {"committed", worker.committed},
+          {"failures", worker.failures}, {"set_aside", worker.set_aside},
           {"idle_s", worker.idle_s}};
 }
 
@@ -136,8 +132,7 @@ std::string FarmStatusText(const FarmStatus& status) {
   text += "\nWORKER            THREADS  LEASES  TILES    FAILURES  IDLE     NAME\n";
   for (const WorkerStatus& worker : status.workers) {
     text += Format("%-17s %-8u %-7u %-8llu %-9llu %-8s %s%s\n", worker.id.value.c_str(),
-                   worker.threads, worker.leases,
-                   static_cast<unsigned long long>(worker.committed),
+                   worker.threads, worker.leases, static_cast<unsigned long long>(worker.committed),
                    static_cast<unsigned long long>(worker.failures),
                    DurationText(worker.idle_s).c_str(), worker.name.c_str(),
                    worker.set_aside ? " (set aside)" : "");

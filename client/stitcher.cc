@@ -64,8 +64,8 @@ absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info) {
 absl::Status Stitcher::Add(const TileData& tile) {
   const std::string name = "tile " + std::to_string(tile.tile);
   if (tile.tile >= tiles_.size()) {
-    return absl::DataLossError(name + " is not one of the job's " +
-                               std::to_string(tiles_.size()) + " tiles");
+    return absl::DataLossError(name + " is not one of the job's " + std::to_string(tiles_.size()) +
+                               " tiles");
   }
   if (have_[tile.tile]) return absl::OkStatus();
   const TileInfo& expected = tiles_[tile.tile];

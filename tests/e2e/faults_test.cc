@@ -15,9 +15,21 @@ using Json = nlohmann::json;
 
 // A dozen tiles of about half a second each.
 std::vector<std::string> Job(const std::string& output) {
-  return {SceneFile("cornell.gltf"), "--resolution", "128x96", "--integrator", "pt", "--paths",
-          "1024",                    "--tile",       "32",     "--points",     "100",
-          "--light-samples",         "4",            "-o",     output};
+  return {SceneFile("cornell.gltf"),
+          "--resolution",
+          "128x96",
+          "--integrator",
+          "pt",
+          "--paths",
+          "1024",
+          "--tile",
+          "32",
+          "--points",
+          "100",
+          "--light-samples",
+          "4",
+          "-o",
+          output};
 }
 
 class Faults : public testing::Test {

@@ -13,10 +13,24 @@ namespace {
 const PixelRect kCrop{21, 33, 101, 90};
 
 std::vector<std::string> Scene(const std::string& integrator) {
-  return {SceneFile("cornell.gltf"), "--resolution",    "150x118", "--points", "3000",
-          "--light-samples",         "2",               "--paths", "4",        "--clusters",
-          "8",                       "--microbuffer",   "8",       "--aov",    "irradiance",
-          "--integrator",            integrator,        "--quiet"};
+  return {SceneFile("cornell.gltf"),
+          "--resolution",
+          "150x118",
+          "--points",
+          "3000",
+          "--light-samples",
+          "2",
+          "--paths",
+          "4",
+          "--clusters",
+          "8",
+          "--microbuffer",
+          "8",
+          "--aov",
+          "irradiance",
+          "--integrator",
+          integrator,
+          "--quiet"};
 }
 
 std::vector<std::string> operator+(std::vector<std::string> a, const std::vector<std::string>& b) {
@@ -54,8 +68,8 @@ TEST_P(Determinism, OneHashForAllWorkersThreadsTilesAndCropsEmbeddedAndFarmed) {
       for (const char* tile : {"32", "64", "128"}) {
         SCOPED_TRACE(std::string("embedded, workers ") + workers + ", threads " + threads +
                      ", tile " + tile);
-        const std::vector<std::string> flags = {"--workers", workers, "--threads", threads,
-                                                "--tile", tile};
+        const std::vector<std::string> flags = {"--workers", workers,  "--threads",
+                                                threads,     "--tile", tile};
         EXPECT_EQ(ImageHashOf(Render(embedded, flags)), whole);
         EXPECT_EQ(ImageHashOf(Render(embedded, flags + crop_flags)), crop);
       }
@@ -72,8 +86,9 @@ TEST_P(Determinism, OneHashForAllWorkersThreadsTilesAndCropsEmbeddedAndFarmed) {
         SCOPED_TRACE("farmed, workers " + std::to_string(workers) + ", threads " +
                      std::to_string(threads) + ", tile " + tile);
         EXPECT_EQ(ImageHashOf(Render(farmed, {"--tile", tile})), whole);
-        EXPECT_EQ(ImageHashOf(Render(farmed, crop_flags + std::vector<std::string>{"--tile", tile})),
-                  crop);
+        EXPECT_EQ(
+            ImageHashOf(Render(farmed, crop_flags + std::vector<std::string>{"--tile", tile})),
+            crop);
       }
     }
     farm_.StopWorkers();
@@ -86,9 +101,9 @@ INSTANTIATE_TEST_SUITE_P(Integrators, Determinism, testing::Values("fpbgi", "pbg
 TEST(DeterminismOfFiles, EqualImagesAreEqualFiles) {
   Farm farm;
   for (const char* name : {"a.exr", "b.exr"}) {
-    const RunResult result = farm.Client(std::vector<std::string>{"render"} + Scene("fpbgi") +
-                                         std::vector<std::string>{"-o", farm.File(name), "--tile",
-                                                                  name[0] == 'a' ? "32" : "64"});
+    const RunResult result = farm.Client(
+        std::vector<std::string>{"render"} + Scene("fpbgi") +
+        std::vector<std::string>{"-o", farm.File(name), "--tile", name[0] == 'a' ? "32" : "64"});
     ASSERT_EQ(result.exit_code, 0) << result.err;
   }
   EXPECT_EQ(farm.Read("a.exr"), farm.Read("b.exr"));
@@ -99,9 +114,9 @@ TEST(DeterminismOfSeeds, AnotherSeedIsAnotherImage) {
   std::string hashes[2];
   for (const char* seed : {"0", "1"}) {
     const std::string output = farm.File(std::string(seed) + ".exr");
-    const RunResult result = farm.Client(
-        std::vector<std::string>{"render"} + Scene("fpbgi") +
-        std::vector<std::string>{"-o", output, "--seed", seed, "--crop", "0,0,64,64"});
+    const RunResult result =
+        farm.Client(std::vector<std::string>{"render"} + Scene("fpbgi") +
+                    std::vector<std::string>{"-o", output, "--seed", seed, "--crop", "0,0,64,64"});
     ASSERT_EQ(result.exit_code, 0) << result.err;
     hashes[seed[0] - '0'] = ImageHashOf(output);
   }

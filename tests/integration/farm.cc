@@ -70,9 +70,12 @@ void Farm::StartServer(const std::vector<std::string>& flags) {
 size_t Farm::StartWorker(int threads, const std::vector<std::string>& flags) {
   const std::string name = "worker" + std::to_string(runs_++);
   std::vector<std::string> args = {BinFolder() + "/farpoint-worker",
-                                   "--coordinator", address(),
-                                   "--cache", File(name + ".cache"),
-                                   "--threads", std::to_string(threads)};
+                                   "--coordinator",
+                                   address(),
+                                   "--cache",
+                                   File(name + ".cache"),
+                                   "--threads",
+                                   std::to_string(threads)};
   args.insert(args.end(), flags.begin(), flags.end());
   workers_.push_back(std::make_unique<Process>(args, File(name + ".log"), File(name + ".log")));
   return workers_.size() - 1;

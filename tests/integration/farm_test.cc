@@ -1,4 +1,6 @@
 // Submit, status, cancel, fetch and compare against a real coordinator and real workers.
+#include "tests/integration/farm.h"
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -7,7 +9,6 @@
 #include <nlohmann/json.hpp>
 
 #include "core/image/exr_io.h"
-#include "tests/integration/farm.h"
 
 namespace farpoint {
 namespace {
@@ -25,14 +26,33 @@ std::vector<std::string> operator+(std::vector<std::string> a, const std::vector
 }
 
 std::vector<std::string> SmallScene() {
-  return {SceneFile("cornell.gltf"), "--resolution", "64x64", "--points", "1500",
-          "--light-samples",         "1",            "--tile", "32",      "--clusters", "4",
-          "--microbuffer",           "8"};
+  return {SceneFile("cornell.gltf"),
+          "--resolution",
+          "64x64",
+          "--points",
+          "1500",
+          "--light-samples",
+          "1",
+          "--tile",
+          "32",
+          "--clusters",
+          "4",
+          "--microbuffer",
+          "8"};
 }
 // Minutes of work in tiles that start and finish often.
 std::vector<std::string> LongJob() {
-  return {SceneFile("cornell.gltf"), "--resolution", "1024x1024", "--integrator", "pt",
-          "--paths",                 "4096",         "--tile",    "32",           "--points", "10"};
+  return {SceneFile("cornell.gltf"),
+          "--resolution",
+          "1024x1024",
+          "--integrator",
+          "pt",
+          "--paths",
+          "4096",
+          "--tile",
+          "32",
+          "--points",
+          "10"};
 }
 
 class FarmTest : public testing::Test {
@@ -44,8 +64,8 @@ class FarmTest : public testing::Test {
   }
   // The id of a job that nobody waits for.
   std::string Detach(const std::vector<std::string>& scene) {
-    const RunResult result = Run(std::vector<std::string>{"submit"} + scene +
-                                 std::vector<std::string>{"--detach"});
+    const RunResult result =
+        Run(std::vector<std::string>{"submit"} + scene + std::vector<std::string>{"--detach"});
     EXPECT_EQ(result.exit_code, 0) << result.err;
     EXPECT_THAT(result.out, testing::MatchesRegex("[0-9a-f]+\n"));
     return result.out.substr(0, result.out.find('\n'));
@@ -123,8 +143,8 @@ TEST_F(FarmTest, ADetachedJobIsFetchedLater) {
   EXPECT_TRUE(WaitUntil(seconds(60), [&] { return StateOf(job) == "done"; })) << farm_.Logs();
   const Json status = Json::parse(farm_.Status(job));
   EXPECT_EQ(status["id"], job);
-  EXPECT_EQ(status["tiles"], Json({{"queued", 0}, {"leased", 0}, {"committed", 4}, {"failed", 0},
-                                   {"total", 4}}));
+  EXPECT_EQ(status["tiles"],
+            Json({{"queued", 0}, {"leased", 0}, {"committed", 4}, {"failed", 0}, {"total", 4}}));
   EXPECT_TRUE(status.contains("eta_s"));
   EXPECT_EQ(status["reissued"], 0);
   EXPECT_EQ(status["refused_results"], 0);
@@ -135,8 +155,8 @@ TEST_F(FarmTest, ADetachedJobIsFetchedLater) {
 }
 
 TEST_F(FarmTest, StatusListsJobsAndWorkers) {
-  EXPECT_EQ(Json::parse(farm_.Status()), Json({{"jobs", Json::array()},
-                                               {"workers", Json::array()}}));
+  EXPECT_EQ(Json::parse(farm_.Status()),
+            Json({{"jobs", Json::array()}, {"workers", Json::array()}}));
   farm_.StartWorker(2);
   const std::string job = Detach(SmallScene() + std::vector<std::string>{"--title", "the title"});
   EXPECT_TRUE(WaitUntil(seconds(30), [&] {
@@ -192,9 +212,9 @@ TEST_F(FarmTest, ACancelledJobEndsForAllWhoWait) {
 }
 
 TEST_F(FarmTest, AnUnknownJobIsAPermanentError) {
-  for (const std::vector<std::string>& args :
-       {std::vector<std::string>{"status", "deadbeef"}, {"cancel", "deadbeef"},
-        {"fetch", "deadbeef", "-o", farm_.File("x.exr")}}) {
+  for (const std::vector<std::string>& args : {std::vector<std::string>{"status", "deadbeef"},
+                                               {"cancel", "deadbeef"},
+                                               {"fetch", "deadbeef", "-o", farm_.File("x.exr")}}) {
     const RunResult result = Run(args);
     EXPECT_EQ(result.exit_code, 42) << args[0];
     EXPECT_THAT(result.err, AllOf(StartsWith("farpoint: error: "), HasSubstr("deadbeef")));
@@ -223,7 +243,9 @@ TEST_F(FarmTest, ASignalEndsTheClientButNotTheJob) {
 TEST(Client, SaysTryAgainWhereNoCoordinatorAnswers) {
   Farm farm;
   for (const std::vector<std::string>& args :
-       {std::vector<std::string>{"status"}, {"cancel", "ab"}, {"fetch", "ab", "-o", "x.exr"},
+       {std::vector<std::string>{"status"},
+        {"cancel", "ab"},
+        {"fetch", "ab", "-o", "x.exr"},
         {"submit", SceneFile("cornell.gltf"), "-o", "x.exr"}}) {
     // Port 9 is the discard service, which nobody runs.
     const RunResult result =
@@ -254,15 +276,15 @@ TEST(Client, StopsAnEmbeddedRenderAtOnce) {
 TEST(Client, ComparesImages) {
   Farm farm;
   for (const char* integrator : {"pbgi", "fpbgi"}) {
-    ASSERT_EQ(farm.Client(std::vector<std::string>{"render"} + SmallScene() +
-                          std::vector<std::string>{"-o", farm.File(std::string(integrator) + ".exr"),
-                                                   "--integrator", integrator, "--aov",
-                                                   "irradiance"})
-                  .exit_code,
-              0);
+    ASSERT_EQ(
+        farm.Client(std::vector<std::string>{"render"} + SmallScene() +
+                    std::vector<std::string>{"-o", farm.File(std::string(integrator) + ".exr"),
+                                             "--integrator", integrator, "--aov", "irradiance"})
+            .exit_code,
+        0);
   }
-  const RunResult same = farm.Client({"compare", farm.File("pbgi.exr"), farm.File("pbgi.exr"),
-                                      "--json", "-"});
+  const RunResult same =
+      farm.Client({"compare", farm.File("pbgi.exr"), farm.File("pbgi.exr"), "--json", "-"});
   ASSERT_EQ(same.exit_code, 0) << same.err;
   const Json equal = Json::parse(same.out);
   EXPECT_EQ(equal["hash_equal"], true);

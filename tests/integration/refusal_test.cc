@@ -36,9 +36,15 @@ class Refusal : public testing::Test {
   // Both ways of rendering refuse `scene` with exit code 42 and a first line that holds `words`.
   static void ExpectRefused(const std::string& scene, const std::vector<std::string>& words) {
     for (const bool farmed : {false, true}) {
-      std::vector<std::string> args = {farmed ? "submit" : "render", scene, "-o",
-                                       farm_->File("refused.exr"), "--resolution", "32x32",
-                                       "--points", "200", "--quiet"};
+      std::vector<std::string> args = {farmed ? "submit" : "render",
+                                       scene,
+                                       "-o",
+                                       farm_->File("refused.exr"),
+                                       "--resolution",
+                                       "32x32",
+                                       "--points",
+                                       "200",
+                                       "--quiet"};
       if (farmed) args = farm_->WithCoordinator(args);
       const RunResult result = farm_->Client(args);
       SCOPED_TRACE(args[0] + " says: " + result.err);
@@ -55,9 +61,9 @@ class Refusal : public testing::Test {
 Farm* Refusal::farm_ = nullptr;
 
 TEST_F(Refusal, TheUndamagedSceneIsFine) {
-  const RunResult result = farm_->Client({"render", farm_->File("good.gltf"), "-o",
-                                          farm_->File("good.exr"), "--resolution", "32x32",
-                                          "--points", "200", "--quiet"});
+  const RunResult result =
+      farm_->Client({"render", farm_->File("good.gltf"), "-o", farm_->File("good.exr"),
+                     "--resolution", "32x32", "--points", "200", "--quiet"});
   EXPECT_EQ(result.exit_code, 0) << result.err;
   EXPECT_EQ(result.err, "");
 }
@@ -106,9 +112,9 @@ TEST_F(Refusal, OfIndicesThatPointNowhere) {
 
 TEST_F(Refusal, OfAJobFileNamesItsPlaceAndTheNearestKey) {
   ExpectRefused(farm_->Write("cut.json", R"({"asset": {"root": "good.gltf")"), {"cut.json"});
-  ExpectRefused(farm_->Write("typo.json",
-                             R"({"asset": {"root": "good.gltf"}, "settings": {"cluster": 4}})"),
-                {"typo.json", "cluster", "clusters"});
+  ExpectRefused(
+      farm_->Write("typo.json", R"({"asset": {"root": "good.gltf"}, "settings": {"cluster": 4}})"),
+      {"typo.json", "cluster", "clusters"});
   ExpectRefused(farm_->Write("range.json",
                              R"({"asset": {"root": "good.gltf"}, "settings": {"spp": 100000}})"),
                 {"range.json", "spp"});
@@ -118,9 +124,16 @@ TEST_F(Refusal, OfAJobFileNamesItsPlaceAndTheNearestKey) {
 
 TEST_F(Refusal, OfACameraThatTheSceneDoesNotHave) {
   for (const bool farmed : {false, true}) {
-    std::vector<std::string> args = {farmed ? "submit" : "render", farm_->File("good.gltf"), "-o",
-                                     farm_->File("refused.exr"), "--camera", "nobody",
-                                     "--resolution", "32x32", "--points", "200"};
+    std::vector<std::string> args = {farmed ? "submit" : "render",
+                                     farm_->File("good.gltf"),
+                                     "-o",
+                                     farm_->File("refused.exr"),
+                                     "--camera",
+                                     "nobody",
+                                     "--resolution",
+                                     "32x32",
+                                     "--points",
+                                     "200"};
     if (farmed) args = farm_->WithCoordinator(args);
     const RunResult result = farm_->Client(args);
     EXPECT_EQ(result.exit_code, 42);

@@ -61,17 +61,17 @@ TEST(CommandLine, EveryRenderFlagReachesTheJob) {
 }
 
 TEST(CommandLine, ValuesMayBeNegativeOrJoined) {
-  EXPECT_THAT(Parse({"render", "--eye", "-1,-2,3", "--target=-4,0,0", "a.glb", "-o", "o.exr"})
-                  .render_flags,
-              ElementsAre(Pair("--eye", "-1,-2,3"), Pair("--target", "-4,0,0")));
+  EXPECT_THAT(
+      Parse({"render", "--eye", "-1,-2,3", "--target=-4,0,0", "a.glb", "-o", "o.exr"}).render_flags,
+      ElementsAre(Pair("--eye", "-1,-2,3"), Pair("--target", "-4,0,0")));
 }
 
 TEST(CommandLine, RepeatedFlagsCountOnceOrAll) {
-  EXPECT_THAT(Parse({"render", "a.glb", "-o", "o.exr", "--spp", "2", "--sun", "0,1,0:1,1,1",
-                     "--spp", "3", "--sun", "1,1,0:1,1,1"})
-                  .render_flags,
-              ElementsAre(Pair("--spp", "3"), Pair("--sun", "0,1,0:1,1,1"),
-                          Pair("--sun", "1,1,0:1,1,1")));
+  EXPECT_THAT(
+      Parse({"render", "a.glb", "-o", "o.exr", "--spp", "2", "--sun", "0,1,0:1,1,1", "--spp", "3",
+             "--sun", "1,1,0:1,1,1"})
+          .render_flags,
+      ElementsAre(Pair("--spp", "3"), Pair("--sun", "0,1,0:1,1,1"), Pair("--sun", "1,1,0:1,1,1")));
 }
 
 TEST(CommandLine, FlagsDoNotSwallowTheScene) {
@@ -189,8 +189,9 @@ class ConfigFile : public testing::Test {
 };
 
 TEST_F(ConfigFile, GivesFlagsThatTheCommandLineOverrides) {
-  const std::string path = Write("# a comment\nspp = 4\n\n  tile=64 \r\nno-skip = true\n"
-                                 "quiet = false\noutput = \"from file.exr\"\n; another\n");
+  const std::string path = Write(
+      "# a comment\nspp = 4\n\n  tile=64 \r\nno-skip = true\n"
+      "quiet = false\noutput = \"from file.exr\"\n; another\n");
   const CommandLine line = Parse({"render", "a.glb", "--config", path, "--spp", "8"});
   EXPECT_THAT(line.render_flags,
               ElementsAre(Pair("--spp", "8"), Pair("--tile", "64"), Pair("--no-skip", "")));

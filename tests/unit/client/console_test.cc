@@ -45,8 +45,9 @@ TEST(Console, PutsItsNameInFrontOfEachLine) {
   console.Error("film is empty");
   console.Warn("slow");
   console.Info("job 1");
-  EXPECT_EQ(capture.Text(), "farpoint: error: film is empty\nfarpoint: warning: slow\n"
-                            "farpoint: job 1\n");
+  EXPECT_EQ(capture.Text(),
+            "farpoint: error: film is empty\nfarpoint: warning: slow\n"
+            "farpoint: job 1\n");
 }
 
 TEST(Console, ShowsOnlyWhatItsLevelLetsThrough) {

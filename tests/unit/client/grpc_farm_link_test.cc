@@ -61,15 +61,19 @@ class FakeBlobs final : public v1::BlobService::Service {
   uint64_t announced = 0;
   size_t largest_chunk = 0;
   bool refuse = false;
+  bool stall = false;
 
   grpc::Status FindMissing(grpc::ServerContext*, const v1::FindMissingRequest* request,
                            v1::FindMissingResponse* response) override {
     for (const std::string& hex : request->sha256()) response->add_sha256(hex);
     return grpc::Status::OK;
   }
-  grpc::Status Put(grpc::ServerContext*, grpc::ServerReader<v1::PutBlobChunk>* reader,
+  grpc::Status Put(grpc::ServerContext* context, grpc::ServerReader<v1::PutBlobChunk>* reader,
                    v1::PutBlobResponse*) override {
     if (refuse) return {grpc::StatusCode::RESOURCE_EXHAUSTED, "the store is full"};
+    while (stall && !context->IsCancelled()) {
+      std::this_thread::sleep_for(std::chrono::milliseconds(5));
+    }
     v1::PutBlobChunk chunk;
     for (bool first = true; reader->Read(&chunk); first = false) {
       if (first) {
@@ -93,7 +97,7 @@ class GrpcFarmLinkTest : public testing::Test {
     builder.RegisterService(&blobs_);
     server_ = builder.BuildAndStart();
     ASSERT_NE(server_, nullptr);
-    link_ = MakeGrpcFarmLink("127.0.0.1:" + std::to_string(port));
+    link_ = MakeGrpcFarmLink("127.0.0.1:" + std::to_string(port), stop_);
   }
   void TearDown() override {
     if (server_) server_->Shutdown(std::chrono::system_clock::now());
@@ -120,6 +124,7 @@ class GrpcFarmLinkTest : public testing::Test {
     });
   }
 
+  StopFlag stop_;
   FakeJobs jobs_;
   FakeBlobs blobs_;
   std::unique_ptr<grpc::Server> server_;
@@ -173,19 +178,31 @@ TEST_F(GrpcFarmLinkTest, AnAbsentCoordinatorIsUnavailableAtOnce) {
 }
 
 TEST_F(GrpcFarmLinkTest, ASignalEndsAWatch) {
-  StopFlag stop;
   std::vector<uint64_t> sequences;
   std::thread raiser([&] {
     for (int i = 0; i < 1000 && !jobs_.watching; ++i) {
       std::this_thread::sleep_for(std::chrono::milliseconds(5));
     }
-    stop.Raise(2);
+    stop_.Raise(2);
   });
   const absl::Status status = link_->Watch(
-      JobId{"1"}, 41, stop, [&](const JobEvent& event) { sequences.push_back(event.sequence); });
+      JobId{"1"}, 41, [&](const JobEvent& event) { sequences.push_back(event.sequence); });
   raiser.join();
   EXPECT_TRUE(absl::IsCancelled(status)) << status;
   EXPECT_THAT(sequences, testing::ElementsAre(42u));
+}
+
+TEST_F(GrpcFarmLinkTest, ASignalEndsAnUpload) {
+  blobs_.stall = true;
+  // More than flow control lets through to a reader that does not read.
+  const Blob blob = Blob::FromString(std::string(size_t{64} << 20, 'x'));
+  std::thread raiser([&] {
+    std::this_thread::sleep_for(std::chrono::milliseconds(100));
+    stop_.Raise(2);
+  });
+  const absl::Status status = link_->Put(blob.Hash(), blob);
+  raiser.join();
+  EXPECT_TRUE(absl::IsCancelled(status)) << status;
 }
 
 TEST_F(GrpcFarmLinkTest, JoinsThePiecesOfTiles) {

@@ -51,10 +51,10 @@ TEST_F(PrepareRequestTest, CollectsTheScenesFiles) {
 }
 
 TEST_F(PrepareRequestTest, AJobFileNamesItsAssetFromItsOwnFolder) {
-  const auto request = Prepare(
-      Job(R"({"asset": {"root": "../scenes/a.gltf"}, "settings": {"spp": 3, "clusters": 9},
+  const auto request =
+      Prepare(Job(R"({"asset": {"root": "../scenes/a.gltf"}, "settings": {"spp": 3, "clusters": 9},
               "film": {"width_px": 64, "height_px": 48}, "title": "t"})"),
-      {{"--spp", "5"}});
+              {{"--spp", "5"}});
   ASSERT_TRUE(request.ok()) << request.status();
   EXPECT_EQ(request->spec.settings.spp, 5u) << "the flag overrides the file";
   EXPECT_EQ(request->spec.settings.clusters, 9u);
@@ -70,7 +70,8 @@ TEST_F(PrepareRequestTest, AnUnknownKeyOfAJobFileIsNamedWithTheNearestOne) {
 }
 
 TEST_F(PrepareRequestTest, DamagedJobFilesAreTheFilesFault) {
-  for (const char* text : {"", "{", "[]", "{\"asset\": 3}", "{\"settings\": {\"spp\": \"many\"}}"}) {
+  for (const char* text :
+       {"", "{", "[]", "{\"asset\": 3}", "{\"settings\": {\"spp\": \"many\"}}"}) {
     const std::string path = Job(text);
     EXPECT_THAT(FileError(path), HasSubstr(path)) << text;
   }
@@ -79,9 +80,8 @@ TEST_F(PrepareRequestTest, DamagedJobFilesAreTheFilesFault) {
               AllOf(StartsWith(folder_.File("jobs/job.json")), HasSubstr("spp")));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "job.json"}})")), HasSubstr("job file"));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "a.obj"}})")), HasSubstr("not built yet"));
-  EXPECT_THAT(
-      FileError(Job(R"({"asset": {"root": "../scenes/a.gltf", "files": [{"uri": "x"}]}})")),
-      HasSubstr("asset.files"));
+  EXPECT_THAT(FileError(Job(R"({"asset": {"root": "../scenes/a.gltf", "files": [{"uri": "x"}]}})")),
+              HasSubstr("asset.files"));
 }
 
 TEST_F(PrepareRequestTest, MissingFilesAreNamed) {

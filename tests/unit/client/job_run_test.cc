@@ -18,6 +18,8 @@ using testing::HasSubstr;
 // A coordinator in memory that fails where a test wants it to.
 class FakeFarm final : public FarmLink {
  public:
+  explicit FakeFarm(const StopFlag& stop) : stop(stop) {}
+  const StopFlag& stop;
   // Each call first takes a status from here, if there is one.
   std::vector<absl::Status> failures;
   std::map<Digest, Blob> blobs;
@@ -46,9 +48,9 @@ class FakeFarm final : public FarmLink {
     return absl::OkStatus();
   }
   absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) override {
-    const JobId id = submissions.try_emplace(submission_id, JobId{std::to_string(
-                                                                submissions.size() + 1)})
-                         .first->second;
+    const JobId id =
+        submissions.try_emplace(submission_id, JobId{std::to_string(submissions.size() + 1)})
+            .first->second;
     FP_RETURN_IF_ERROR(Next());  // the job is made, the answer is lost
     return id;
   }
@@ -59,7 +61,7 @@ class FakeFarm final : public FarmLink {
     return status;
   }
   absl::Status Cancel(const JobId&) override { return Next(); }
-  absl::Status Watch(const JobId&, uint64_t after, const StopFlag& stop,
+  absl::Status Watch(const JobId&, uint64_t after,
                      const std::function<void(const JobEvent&)>& on_event) override {
     watched_after.push_back(after);
     for (const JobEvent& event : events) {
@@ -121,10 +123,13 @@ class JobRunTest : public testing::Test {
 
   StopFlag stop_;
   Console console_{stderr, false, LogLevel::kOff, true};
-  FakeFarm farm_;
-  Retry retry_{{.first_wait = milliseconds(1), .longest_wait = milliseconds(1),
+  FakeFarm farm_{stop_};
+  Retry retry_{{.first_wait = milliseconds(1),
+                .longest_wait = milliseconds(1),
                 .patience = milliseconds(200)},
-               "coordinator fake:1", stop_, console_};
+               "coordinator fake:1",
+               stop_,
+               console_};
   JobRun run_{farm_, retry_, stop_, console_};
 };
 
@@ -143,9 +148,8 @@ TEST_F(JobRunTest, SendsOnlyWhatIsMissing) {
 TEST_F(JobRunTest, MakesOneJobThoughTheAnswerIsLost) {
   const PreparedRequest request = Request({"one"});
   // FindMissing, Put, Submit each fail once.
-  farm_.failures = {absl::UnavailableError("a"), absl::OkStatus(),
-                    absl::UnavailableError("b"), absl::OkStatus(),
-                    absl::DeadlineExceededError("c")};
+  farm_.failures = {absl::UnavailableError("a"), absl::OkStatus(), absl::UnavailableError("b"),
+                    absl::OkStatus(), absl::DeadlineExceededError("c")};
   const auto id = run_.Submit(request);
   ASSERT_TRUE(id.ok()) << id.status();
   EXPECT_EQ(farm_.submissions.size(), 1u);
@@ -195,8 +199,8 @@ TEST_F(JobRunTest, StopsWaitingWhenASignalComes) {
 TEST_F(JobRunTest, FetchesAndStitches) {
   const auto job = run_.Fetch(JobId{"1"});
   ASSERT_TRUE(job.ok()) << job.status();
-  EXPECT_EQ(ImageHash(job->film), ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty,
-                                                                        Layer::kDepth})));
+  EXPECT_EQ(ImageHash(job->film),
+            ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty, Layer::kDepth})));
   EXPECT_EQ(farm_.tiles_sent, 6);
 }
 
@@ -211,8 +215,8 @@ TEST_F(JobRunTest, FetchesADamagedTileAgain) {
   const auto job = run_.Fetch(JobId{"1"});
   ASSERT_TRUE(job.ok()) << job.status();
   EXPECT_EQ(farm_.tiles_sent, 8);
-  EXPECT_EQ(ImageHash(job->film), ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty,
-                                                                        Layer::kDepth})));
+  EXPECT_EQ(ImageHash(job->film),
+            ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty, Layer::kDepth})));
 }
 
 TEST_F(JobRunTest, GivesUpOnTilesThatAreAlwaysDamaged) {

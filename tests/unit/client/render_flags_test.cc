@@ -118,11 +118,9 @@ TEST(RenderFlags, CameraByName) {
 }
 
 TEST(RenderFlags, FreeCamera) {
-  const LookAt look = std::get<LookAt>(Apply({{"--eye", "1,2,3"},
-                                              {"--target", "-1,0,1e-3"},
-                                              {"--up", "0,0,1"},
-                                              {"--fov", "60"}})
-                                           .camera);
+  const LookAt look = std::get<LookAt>(
+      Apply({{"--eye", "1,2,3"}, {"--target", "-1,0,1e-3"}, {"--up", "0,0,1"}, {"--fov", "60"}})
+          .camera);
   EXPECT_EQ(look.eye, Vec3d(1, 2, 3));
   EXPECT_EQ(look.target, Vec3d(-1, 0, 1e-3));
   EXPECT_EQ(look.up, Vec3d(0, 0, 1));
@@ -176,16 +174,17 @@ TEST(RenderFlags, ALaterFlagMayHealAnEarlierOne) {
   JobSpec spec;
   spec.settings.integrator = Integrator::kPbgi;
   spec.settings.buffer_map = BufferMap::kCosine;
-  EXPECT_EQ(Apply({{"--integrator", "fpbgi"}, {"--buffer-map", "octahedral"}}, spec)
-                .settings.integrator,
-            Integrator::kFpbgi);
+  EXPECT_EQ(
+      Apply({{"--integrator", "fpbgi"}, {"--buffer-map", "octahedral"}}, spec).settings.integrator,
+      Integrator::kFpbgi);
   EXPECT_THAT(Refusal({{"--integrator", "fpbgi"}}, spec), StartsWith("--integrator fpbgi: "));
 }
 
 TEST(RenderFlags, LeaveTheJobAloneWhenTheyAreRefused) {
   JobSpec spec;
   spec.settings.spp = 3;
-  EXPECT_FALSE(ApplyRenderFlags(std::vector<GivenFlag>{{"--spp", "5"}, {"--tile", "7"}}, spec).ok());
+  EXPECT_FALSE(
+      ApplyRenderFlags(std::vector<GivenFlag>{{"--spp", "5"}, {"--tile", "7"}}, spec).ok());
   EXPECT_EQ(spec.settings.spp, 3u);
 }
 
@@ -210,8 +209,8 @@ INSTANTIATE_TEST_SUITE_P(
     testing::Values(
         BadValue{"--integrator", "pbgii", "did you mean 'pbgi'?"},
         BadValue{"--integrator", "irrcache", "not built yet"},
-        BadValue{"--resolution", "640", "WIDTHxHEIGHT"},
-        BadValue{"--resolution", "0x10", ""}, BadValue{"--resolution", "70000x10", ""},
+        BadValue{"--resolution", "640", "WIDTHxHEIGHT"}, BadValue{"--resolution", "0x10", ""},
+        BadValue{"--resolution", "70000x10", ""},
         BadValue{"--resolution", "10x10x10", "WIDTHxHEIGHT"},
         BadValue{"--crop", "0,0,10", "x0,y0,x1,y1"}, BadValue{"--crop", "0,0,1281,10", ""},
         BadValue{"--crop", "5,5,5,9", ""}, BadValue{"--spp", "0", "spp"},

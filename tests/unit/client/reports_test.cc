@@ -31,10 +31,10 @@ TEST(StatisticsJson, HasExactlyItsKeysEvenOfNothing) {
               UnorderedElementsAre("import", "sample", "shade", "tree", "broadcast", "primary",
                                    "direct", "cluster", "cut", "raster", "composite", "convolve",
                                    "trace", "total", "wall"));
-  EXPECT_THAT(Keys(json["wall_seconds"]),
-              UnorderedElementsAre("import", "sample", "shade", "tree", "broadcast", "primary",
-                                   "direct", "cluster", "cut", "raster", "composite", "convolve",
-                                   "trace"));
+  EXPECT_THAT(
+      Keys(json["wall_seconds"]),
+      UnorderedElementsAre("import", "sample", "shade", "tree", "broadcast", "primary", "direct",
+                           "cluster", "cut", "raster", "composite", "convolve", "trace"));
   EXPECT_THAT(Keys(json["counts"]),
               UnorderedElementsAre("triangles", "surfels", "nodes", "receivers", "blocks",
                                    "clusters", "cut_nodes", "rays"));
@@ -87,8 +87,8 @@ TEST(JobStatusJson, HasWhatOthersRely) {
   Json json = Json::parse(JobStatusJson(status));
   EXPECT_EQ(json["id"], "0badcafe");
   EXPECT_EQ(json["state"], "done");
-  EXPECT_EQ(json["tiles"], Json({{"queued", 0}, {"leased", 0}, {"committed", 4}, {"failed", 0},
-                                 {"total", 4}}));
+  EXPECT_EQ(json["tiles"],
+            Json({{"queued", 0}, {"leased", 0}, {"committed", 4}, {"failed", 0}, {"total", 4}}));
   EXPECT_EQ(json["reissued"], 2);
   EXPECT_EQ(json["refused_results"], 3);
   EXPECT_EQ(json["eta_s"], 1.5);
@@ -104,8 +104,8 @@ TEST(JobStatusJson, HasWhatOthersRely) {
 
 TEST(FarmStatusJson, ListsJobsAndWorkers) {
   FarmStatus status;
-  EXPECT_EQ(Json::parse(FarmStatusJson(status)), Json({{"jobs", Json::array()},
-                                                       {"workers", Json::array()}}));
+  EXPECT_EQ(Json::parse(FarmStatusJson(status)),
+            Json({{"jobs", Json::array()}, {"workers", Json::array()}}));
   status.jobs.resize(2);
   status.workers.resize(1);
   status.workers[0].name = "node7";

@@ -12,9 +12,9 @@ using std::chrono::milliseconds;
 class RetryTest : public testing::Test {
  protected:
   Retry Make(milliseconds patience) {
-    return Retry({.first_wait = milliseconds(1), .longest_wait = milliseconds(2),
-                  .patience = patience},
-                 "coordinator test:1", stop_, console_);
+    return Retry(
+        {.first_wait = milliseconds(1), .longest_wait = milliseconds(2), .patience = patience},
+        "coordinator test:1", stop_, console_);
   }
   StopFlag stop_;
   Console console_{stderr, false, LogLevel::kOff, true};
@@ -23,18 +23,22 @@ class RetryTest : public testing::Test {
 TEST_F(RetryTest, TriesAgainUntilTheCoordinatorIsBack) {
   Retry retry = Make(milliseconds(10'000));
   int attempts = 0;
-  EXPECT_TRUE(retry.Run([&] {
-    return ++attempts < 4 ? absl::UnavailableError("refused") : absl::OkStatus();
-  }).ok());
+  EXPECT_TRUE(retry
+                  .Run([&] {
+                    return ++attempts < 4 ? absl::UnavailableError("refused") : absl::OkStatus();
+                  })
+                  .ok());
   EXPECT_EQ(attempts, 4);
 }
 
 TEST_F(RetryTest, TriesAgainAfterADeadline) {
   Retry retry = Make(milliseconds(10'000));
   int attempts = 0;
-  EXPECT_TRUE(retry.Run([&] {
-    return ++attempts < 2 ? absl::DeadlineExceededError("late") : absl::OkStatus();
-  }).ok());
+  EXPECT_TRUE(retry
+                  .Run([&] {
+                    return ++attempts < 2 ? absl::DeadlineExceededError("late") : absl::OkStatus();
+                  })
+                  .ok());
   EXPECT_EQ(attempts, 2);
 }
 
@@ -59,18 +63,19 @@ TEST_F(RetryTest, LosesPatienceAndSaysSo) {
   EXPECT_TRUE(absl::IsUnavailable(status));
   EXPECT_GT(attempts, 2);
   const std::string text(status.message());
-  EXPECT_NE(text.find("coordinator test:1 does not answer (connection refused)"),
-            std::string::npos)
+  EXPECT_NE(text.find("coordinator test:1 does not answer (connection refused)"), std::string::npos)
       << text;
 }
 
 TEST_F(RetryTest, TriesOnceWithoutPatience) {
   Retry retry = Make(milliseconds(0));
   int attempts = 0;
-  EXPECT_FALSE(retry.Run([&] {
-    ++attempts;
-    return absl::UnavailableError("x");
-  }).ok());
+  EXPECT_FALSE(retry
+                   .Run([&] {
+                     ++attempts;
+                     return absl::UnavailableError("x");
+                   })
+                   .ok());
   EXPECT_EQ(attempts, 1);
 }
 

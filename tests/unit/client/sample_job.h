@@ -19,8 +19,8 @@ inline Film SampleFilm(const PixelRect& rect, const std::vector<Layer>& layers) 
       for (int y = rect.y0; y < rect.y1; ++y) {
         for (int x = rect.x0; x < rect.x1; ++x) {
           plane[static_cast<size_t>(y - rect.y0) * rect.width() + (x - rect.x0)] =
-              0.01f * static_cast<float>(x) + 0.5f * static_cast<float>(y) +
-              static_cast<float>(c) + static_cast<float>(layer);
+              0.01f * static_cast<float>(x) + 0.5f * static_cast<float>(y) + static_cast<float>(c) +
+              static_cast<float>(layer);
         }
       }
     }
@@ -46,8 +46,7 @@ inline SampleJob MakeSampleJob(const FilmSpec& film) {
   for (const PixelRect& rect : TilesOf(film, 32)) {
     TileData tile;
     tile.tile = static_cast<uint32_t>(job.tiles.size());
-    tile.bytes =
-        Blob::FromVector(EncodeFilm(SampleFilm(rect, job.info.spec.settings.layers)));
+    tile.bytes = Blob::FromVector(EncodeFilm(SampleFilm(rect, job.info.spec.settings.layers)));
     tile.sha256 = tile.bytes.Hash();
     job.info.tiles.push_back({rect, tile.sha256});
     job.tiles.push_back(std::move(tile));

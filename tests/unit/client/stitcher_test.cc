@@ -66,8 +66,8 @@ TEST(Stitcher, RefusesADamagedTileAndStaysAsItWas) {
     EXPECT_TRUE(absl::IsDataLoss(status)) << at;
     EXPECT_THAT(std::string(status.message()), HasSubstr("tile 0"));
   }
-  EXPECT_TRUE(absl::IsDataLoss(stitcher->Add(
-      WithBytes(job.tiles[0], {bytes.begin(), bytes.begin() + bytes.size() / 2}))));
+  EXPECT_TRUE(absl::IsDataLoss(
+      stitcher->Add(WithBytes(job.tiles[0], {bytes.begin(), bytes.begin() + bytes.size() / 2}))));
   EXPECT_TRUE(absl::IsDataLoss(stitcher->Add(WithBytes(job.tiles[0], {}))));
   EXPECT_THAT(stitcher->Missing(), ElementsAre(0, 1));
   EXPECT_EQ(stitcher->film().Get(Layer::kBeauty, 0, 5, 5), 0);
