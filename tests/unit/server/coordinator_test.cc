@@ -1,0 +1,375 @@
+#include "server/coordinator.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <filesystem>
+#include <fstream>
+#include <thread>
+
+#include "tests/unit/server/fake_render.h"
+#include "tests/unit/server/temp_folder.h"
+
+namespace farpoint {
+namespace {
+
+using std::chrono::milliseconds;
+using ::testing::HasSubstr;
+using ::testing::IsEmpty;
+
+const Digest kFingerprint = Sha256().Update("fingerprint").Finish();
+
+class CoordinatorTest : public ::testing::Test {
+ protected:
+  void Open(const std::string& folder = "") {
+    coordinator_.reset();
+    CoordinatorOptions options;
+    options.store_directory = folder;
+    options.baker = baker_;
+    options.limits = limits_;
+    options.silence_time = milliseconds(300);
+    options.log = [this](const CoordinatorLogEntry& entry) { log_.push_back(entry.text); };
+    auto opened = Coordinator::Open(std::move(options));
+    ASSERT_TRUE(opened.ok()) << opened.status();
+    coordinator_ = *std::move(opened);
+  }
+  JobSpec Spec(const std::string& content = "scene", int width = 64, int height = 32) {
+    JobSpec spec;
+    const Blob blob = Blob::FromString(content);
+    spec.asset_root = "a.gltf";
+    spec.asset_files["a.gltf"] = blob.Hash();
+    spec.film = {.width = width, .height = height, .crop = {0, 0, width, height}};
+    spec.settings.tile_px = 32;
+    spec.settings.layers = {Layer::kBeauty, Layer::kDepth};
+    EXPECT_TRUE(coordinator_->PutBlob(blob.Hash(), blob).ok());
+    return spec;
+  }
+  JobId SubmitOrDie(const JobSpec& spec, const std::string& submission = "") {
+    const auto id = coordinator_->Submit(spec, submission);
+    EXPECT_TRUE(id.ok()) << id.status();
+    return id.ok() ? *id : JobId{};
+  }
+  WorkerId RegisterOrDie() {
+    const auto welcome = coordinator_->Register(
+        {.version = FARPOINT_VERSION, .fingerprint = kFingerprint, .threads = 1, .name = "w"});
+    EXPECT_TRUE(welcome.ok()) << welcome.status();
+    return welcome.ok() ? welcome->id : WorkerId{};
+  }
+  TileWork LeaseOrDie(const WorkerId& worker) {
+    const auto work = coordinator_->Lease(worker, milliseconds(5000));
+    EXPECT_TRUE(work.ok() && work->has_value()) << work.status();
+    return work.ok() && work->has_value() ? **work : TileWork{};
+  }
+  static TileResult Render(const TileWork& work) {
+    TileResult result;
+    result.lease = work.lease;
+    result.attempt = work.attempt;
+    result.bytes = Blob::FromVector(EncodeFilm(FakeTile(work.rect, work.frame.settings.layers)));
+    result.sha256 = result.bytes.Hash();
+    result.stats.counts["receivers"] = static_cast<uint64_t>(work.rect.area());
+    return result;
+  }
+  // Waits for the state, watching events as a client does.
+  JobState WaitForEnd(const JobId& job) {
+    uint64_t after = 0;
+    for (int i = 0; i < 200; ++i) {
+      const auto events = coordinator_->NextEvents(job, after, milliseconds(100));
+      EXPECT_TRUE(events.ok()) << events.status();
+      if (!events.ok()) break;
+      for (const JobEvent& event : *events) {
+        if (event.sequence == 0) continue;
+        EXPECT_EQ(event.sequence, after + 1);
+        after = event.sequence;
+        if (const auto* state = std::get_if<JobState>(&event.body); state && IsFinal(*state)) {
+          EXPECT_THAT(*coordinator_->NextEvents(job, after, milliseconds(1000)), IsEmpty());
+          return *state;
+        }
+      }
+    }
+    ADD_FAILURE() << "the job did not end";
+    return JobState::kQueued;
+  }
+
+  std::shared_ptr<FakeBaker> baker_ = std::make_shared<FakeBaker>();
+  JobLimits limits_;
+  std::vector<std::string> log_;
+  std::unique_ptr<Coordinator> coordinator_;
+};
+
+TEST_F(CoordinatorTest, AJobGoesFromSubmissionToImage) {
+  Open();
+  const JobId job = SubmitOrDie(Spec());
+  const WorkerId worker = RegisterOrDie();
+  for (int i = 0; i < 2; ++i) {
+    const TileWork work = LeaseOrDie(worker);
+    EXPECT_TRUE(coordinator_->GetBlob(work.blobs.prepared_scene).ok());
+    EXPECT_TRUE(work.blobs.tree_radiance.empty());
+    EXPECT_FALSE(coordinator_->Renew(worker, work.lease, {1, 0.5f})->drop);
+    EXPECT_TRUE(coordinator_->Return(worker, Render(work))->accepted);
+  }
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+  const auto info = coordinator_->FetchInfo(job);
+  ASSERT_TRUE(info.ok()) << info.status();
+  EXPECT_EQ(info->status.tiles, (TileCounts{.committed = 2, .total = 2}));
+  EXPECT_EQ(info->stats.counts.at("receivers"), 64u * 32u);
+  EXPECT_EQ(info->stats.counts.at("triangles"), 12u);
+  EXPECT_EQ(info->notes.size(), 2u);
+  EXPECT_NE(info->camera.world_to_ndc[0], 0);
+  for (uint32_t i = 0; i < 2; ++i) {
+    const auto tile = coordinator_->FetchTile(job, i);
+    ASSERT_TRUE(tile.ok()) << tile.status();
+    EXPECT_EQ(tile->sha256, info->tiles[i].sha256);
+    const auto film = DecodeFilm(tile->bytes.bytes());
+    ASSERT_TRUE(film.ok());
+    EXPECT_EQ(film->rect(), info->tiles[i].rect);
+  }
+  EXPECT_TRUE(absl::IsInvalidArgument(coordinator_->FetchTile(job, 2).status()));
+}
+
+TEST_F(CoordinatorTest, WhatIsWrongWithAJobIsSaidAtSubmission) {
+  limits_.max_pixels = 1 << 20;
+  Open();
+  JobSpec spec = Spec();
+  spec.settings.spp = 0;
+  EXPECT_TRUE(absl::IsInvalidArgument(coordinator_->Submit(spec, "").status()));
+  spec = Spec();
+  spec.asset_files["b.png"] = Sha256().Update("never sent").Finish();
+  const auto missing = coordinator_->Submit(spec, "");
+  EXPECT_TRUE(absl::IsFailedPrecondition(missing.status()));
+  EXPECT_THAT(std::string(missing.status().message()), HasSubstr("'b.png'"));
+  EXPECT_TRUE(
+      absl::IsResourceExhausted(coordinator_->Submit(Spec("scene", 2000, 2000), "").status()));
+  limits_ = {};
+  Open();
+  const auto tiles = coordinator_->Submit(Spec("scene", 32768, 32768), "");
+  EXPECT_TRUE(absl::IsInvalidArgument(tiles.status()));
+  EXPECT_THAT(std::string(tiles.status().message()), HasSubstr("tile_px"));
+  EXPECT_THAT(coordinator_->Jobs(), IsEmpty());
+}
+
+TEST_F(CoordinatorTest, ARepeatedSubmissionIsOneJob) {
+  Open();
+  const JobSpec spec = Spec();
+  const JobId first = SubmitOrDie(spec, "token");
+  EXPECT_EQ(SubmitOrDie(spec, "token"), first);
+  EXPECT_NE(SubmitOrDie(spec, ""), first);
+  EXPECT_EQ(coordinator_->Jobs().size(), 2u);
+}
+
+TEST_F(CoordinatorTest, AFailedBakeFailsTheJobWithItsMessage) {
+  baker_->error = absl::InvalidArgumentError("a.gltf: /meshes/0: no positions");
+  Open();
+  const JobId job = SubmitOrDie(Spec());
+  EXPECT_EQ(WaitForEnd(job), JobState::kFailed);
+  EXPECT_EQ(coordinator_->Status(job)->error, baker_->error);
+}
+
+TEST_F(CoordinatorTest, LimitsHoldForWhatTheBakeFound) {
+  limits_.max_surfels = 999;
+  Open();
+  const JobId job = SubmitOrDie(Spec());
+  EXPECT_EQ(WaitForEnd(job), JobState::kFailed);
+  EXPECT_TRUE(absl::IsResourceExhausted(coordinator_->Status(job)->error));
+}
+
+TEST_F(CoordinatorTest, TheSameSceneIsBakedOnce) {
+  Open();
+  JobSpec spec = Spec();
+  const JobId first = SubmitOrDie(spec);
+  const WorkerId worker = RegisterOrDie();
+  const TileWork work = LeaseOrDie(worker);
+  spec.camera = LookAt{.eye = {0, 0, 5}, .target = {0, 0, 0}};
+  spec.priority = 1;
+  const JobId second = SubmitOrDie(spec);
+  TileWork other;
+  while (other.job != second) other = LeaseOrDie(RegisterOrDie());
+  EXPECT_EQ(other.blobs, work.blobs);
+  EXPECT_EQ(other.frame.camera.eye, Vec3d(0, 0, 5));
+  EXPECT_EQ(baker_->bakes.load(), 1);
+  const auto info = coordinator_->FetchInfo(second);
+  EXPECT_EQ(info->stats.skipped.at("bake"), 1u);
+  EXPECT_EQ(info->stats.seconds[static_cast<size_t>(Stage::kTree)], 0);
+  EXPECT_EQ(info->notes, std::vector<std::string>{"another note"});  // it names its own camera
+  EXPECT_NE(first, second);
+}
+
+TEST_F(CoordinatorTest, AnUnknownCameraFailsTheJob) {
+  Open();
+  JobSpec spec = Spec();
+  spec.camera = CameraName{"nowhere"};
+  const JobId job = SubmitOrDie(spec);
+  EXPECT_EQ(WaitForEnd(job), JobState::kFailed);
+  EXPECT_THAT(std::string(coordinator_->Status(job)->error.message()), HasSubstr("'main'"));
+}
+
+TEST_F(CoordinatorTest, DamagedResultsAreRefusedAndTheTileIsRenderedAgain) {
+  Open();
+  const JobId job = SubmitOrDie(Spec("scene", 32, 32));
+  const WorkerId w1 = RegisterOrDie();
+  TileWork work = LeaseOrDie(w1);
+  TileResult result = Render(work);
+  result.sha256 = Sha256().Update("another").Finish();
+  EXPECT_FALSE(coordinator_->Return(w1, result)->accepted);
+
+  const WorkerId w2 = RegisterOrDie();
+  work = LeaseOrDie(w2);
+  result = Render(work);
+  result.bytes = Blob::FromVector(EncodeFilm(FakeTile({0, 0, 32, 16}, {Layer::kBeauty})));
+  result.sha256 = result.bytes.Hash();
+  EXPECT_THAT(coordinator_->Return(w2, result)->reason, HasSubstr("rectangle"));
+  EXPECT_EQ(coordinator_->Status(job)->refused_results, 2u);
+
+  work = LeaseOrDie(w1);
+  EXPECT_EQ(work.attempt, 3u);
+  EXPECT_TRUE(coordinator_->Return(w1, Render(work))->accepted);
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+}
+
+TEST_F(CoordinatorTest, GarbageThreeTimesFailsTheJob) {
+  Open();
+  const JobId job = SubmitOrDie(Spec("scene", 32, 32));
+  for (int i = 0; i < 3; ++i) {
+    const WorkerId worker = RegisterOrDie();
+    TileResult result = Render(LeaseOrDie(worker));
+    result.bytes = Blob::FromString("garbage");
+    result.sha256 = result.bytes.Hash();
+    EXPECT_FALSE(coordinator_->Return(worker, result)->accepted);
+  }
+  EXPECT_EQ(WaitForEnd(job), JobState::kFailed);
+  EXPECT_THAT(std::string(coordinator_->Status(job)->error.message()), HasSubstr("tile 0"));
+}
+
+TEST_F(CoordinatorTest, CancelEndsBakesAndLeases) {
+  baker_->hold = true;
+  Open();
+  const JobId baking = SubmitOrDie(Spec());
+  while (baker_->bakes.load() == 0) std::this_thread::sleep_for(milliseconds(1));
+  ASSERT_TRUE(coordinator_->Cancel(baking).ok());
+  EXPECT_EQ(WaitForEnd(baking), JobState::kCancelled);
+  baker_->hold = false;
+  const JobId rendering = SubmitOrDie(Spec());
+  const WorkerId worker = RegisterOrDie();
+  const TileWork work = LeaseOrDie(worker);
+  ASSERT_TRUE(coordinator_->Cancel(rendering).ok());
+  EXPECT_TRUE(coordinator_->Renew(worker, work.lease, {1, 0})->drop);
+  EXPECT_FALSE(coordinator_->Return(worker, Render(work))->accepted);
+  EXPECT_EQ(WaitForEnd(rendering), JobState::kCancelled);
+  EXPECT_TRUE(coordinator_->Cancel(rendering).ok());  // once more is harmless
+  EXPECT_EQ(coordinator_->Status(rendering)->tiles, (TileCounts{.failed = 2, .total = 2}));
+}
+
+TEST_F(CoordinatorTest, ALostWorkersTileIsLeasedAgain) {
+  Open();
+  const JobId job = SubmitOrDie(Spec("scene", 32, 32));
+  const WorkerId lost = RegisterOrDie();
+  const TileWork stale = LeaseOrDie(lost);
+  const TileWork again = LeaseOrDie(RegisterOrDie());  // waits for the silence to be noticed
+  EXPECT_EQ(again.tile, stale.tile);
+  EXPECT_EQ(again.attempt, 2u);
+  EXPECT_FALSE(coordinator_->Return(lost, Render(stale))->accepted);
+  EXPECT_EQ(coordinator_->Status(job)->reissued, 1u);
+}
+
+TEST_F(CoordinatorTest, UnknownIdsAreNotFound) {
+  Open();
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Status({"x"}).status()));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Cancel({"x"})));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->FetchInfo({"x"}).status()));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->NextEvents({"x"}, 0, milliseconds(0)).status()));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Lease({"x"}, milliseconds(0)).status()));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Renew({"x"}, {"l"}, {}).status()));
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Return({"x"}, {}).status()));
+}
+
+TEST_F(CoordinatorTest, AnotherVersionIsRefused) {
+  Open();
+  const auto welcome = coordinator_->Register(
+      {.version = "0.0.1", .fingerprint = kFingerprint, .threads = 1, .name = "w"});
+  EXPECT_TRUE(absl::IsFailedPrecondition(welcome.status()));
+  EXPECT_THAT(std::string(welcome.status().message()), HasSubstr("0.0.1"));
+}
+
+TEST_F(CoordinatorTest, DrainingRefusesNewWorkButTakesResults) {
+  Open();
+  const JobId job = SubmitOrDie(Spec());
+  const WorkerId worker = RegisterOrDie();
+  const TileWork work = LeaseOrDie(worker);
+  coordinator_->Drain();
+  EXPECT_EQ(coordinator_->ActiveLeases(), 1u);
+  EXPECT_TRUE(absl::IsUnavailable(coordinator_->Lease(worker, milliseconds(0)).status()));
+  EXPECT_TRUE(absl::IsUnavailable(coordinator_->Submit(Spec(), "").status()));
+  EXPECT_TRUE(coordinator_->Return(worker, Render(work))->accepted);
+  EXPECT_EQ(coordinator_->ActiveLeases(), 0u);
+  EXPECT_EQ(coordinator_->Status(job)->tiles.committed, 1u);
+}
+
+TEST_F(CoordinatorTest, AnotherLifeTakesUpWhereThisOneEnds) {
+  TempFolder folder;
+  Open(folder.path());
+  const JobId job = SubmitOrDie(Spec(), "token");
+  WorkerId worker = RegisterOrDie();
+  const TileWork first = LeaseOrDie(worker);
+  ASSERT_TRUE(coordinator_->Return(worker, Render(first))->accepted);
+  const TileWork lost = LeaseOrDie(worker);
+
+  Open(folder.path());
+  EXPECT_EQ(coordinator_->Status(job)->tiles,
+            (TileCounts{.queued = 1, .committed = 1, .total = 2}));
+  EXPECT_EQ(SubmitOrDie(Spec(), "token"), job);
+  EXPECT_TRUE(absl::IsNotFound(coordinator_->Return(worker, Render(lost)).status()));
+  worker = RegisterOrDie();
+  const TileWork second = LeaseOrDie(worker);
+  EXPECT_EQ(second.tile, lost.tile);
+  ASSERT_TRUE(coordinator_->Return(worker, Render(second))->accepted);
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+  EXPECT_EQ(baker_->bakes.load(), 1);
+
+  Open(folder.path());
+  EXPECT_EQ(coordinator_->Status(job)->state, JobState::kDone);
+  EXPECT_EQ(coordinator_->Status(job)->tiles, (TileCounts{.committed = 2, .total = 2}));
+  EXPECT_TRUE(coordinator_->FetchTile(job, 1).ok());
+}
+
+TEST_F(CoordinatorTest, LostBlobsOfAJobInWorkAreBakedAgain) {
+  TempFolder folder;
+  Open(folder.path());
+  const JobId job = SubmitOrDie(Spec());
+  WorkerId worker = RegisterOrDie();
+  const TileWork work = LeaseOrDie(worker);
+  ASSERT_TRUE(coordinator_->Return(worker, Render(work))->accepted);
+  coordinator_.reset();
+  std::filesystem::remove(folder / ("blobs/" + work.blobs.tree_topology.Hex()));
+  Open(folder.path());
+  worker = RegisterOrDie();
+  const TileWork second = LeaseOrDie(worker);
+  EXPECT_NE(second.tile, work.tile);
+  EXPECT_EQ(second.blobs, work.blobs);
+  EXPECT_EQ(baker_->bakes.load(), 2);
+  ASSERT_TRUE(coordinator_->Return(worker, Render(second))->accepted);
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+}
+
+TEST_F(CoordinatorTest, AJobThatWaitsForItsBakeSurvivesToo) {
+  TempFolder folder;
+  baker_->hold = true;
+  Open(folder.path());
+  const JobId job = SubmitOrDie(Spec("scene", 32, 32));
+  while (baker_->bakes.load() == 0) std::this_thread::sleep_for(milliseconds(1));
+  coordinator_.reset();  // stops the bake
+  baker_->hold = false;
+  Open(folder.path());
+  const WorkerId worker = RegisterOrDie();
+  ASSERT_TRUE(coordinator_->Return(worker, Render(LeaseOrDie(worker)))->accepted);
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+}
+
+TEST_F(CoordinatorTest, UnsubmittedFilesAreFoundMissing) {
+  Open();
+  const Digest here = Spec().asset_files.at("a.gltf");
+  const Digest not_here = Sha256().Update("not here").Finish();
+  const std::vector<Digest> asked = {here, not_here};
+  EXPECT_EQ(*coordinator_->FindMissing(asked), std::vector<Digest>{not_here});
+}
+
+}  // namespace
+}  // namespace farpoint

@@ -1,0 +1,87 @@
+#include "server/scene_baker.h"
+
+#include <gtest/gtest.h>
+
+#include "core/scene/procedural.h"
+#include "tests/unit/server/temp_folder.h"
+
+namespace farpoint {
+namespace {
+
+JobSpec SmallJob() {
+  JobSpec job;
+  job.asset_root = "a.gltf";
+  job.asset_files["a.gltf"] = Sha256().Update("a").Finish();
+  job.film = {.width = 64, .height = 32, .crop = {0, 0, 64, 32}};
+  job.settings.points = 500;
+  return job;
+}
+
+TEST(BakeKey, ChangesWithWhatABakeReads) {
+  const Digest key = BakeKey(SmallJob());
+  EXPECT_EQ(BakeKey(SmallJob()), key);
+  const std::vector<std::function<void(JobSpec&)>> changes = {
+      [](JobSpec& j) { j.asset_files["a.gltf"] = Sha256().Update("b").Finish(); },
+      [](JobSpec& j) { j.asset_files["b.png"] = Sha256().Update("b").Finish(); },
+      [](JobSpec& j) { j.settings.points = 501; },
+      [](JobSpec& j) { j.settings.seed = 1; },
+      [](JobSpec& j) { j.settings.light_samples = 3; },
+      [](JobSpec& j) { j.settings.integrator = Integrator::kPt; },
+      [](JobSpec& j) { j.light_units = LightUnits::kRaw; },
+      [](JobSpec& j) { j.overrides.sky = Rgb(0, 0, 0); },
+      [](JobSpec& j) { j.overrides.albedo = Rgb(0, 0, 0); },
+      [](JobSpec& j) {
+        j.overrides.suns = {{{0, 1, 0}, {1, 1, 1}}};
+      },
+  };
+  for (size_t i = 0; i < changes.size(); ++i) {
+    JobSpec job = SmallJob();
+    changes[i](job);
+    EXPECT_NE(BakeKey(job), key) << "change " << i;
+  }
+}
+
+TEST(BakeKey, IsBlindToCameraFilmAndTiles) {
+  JobSpec job = SmallJob();
+  job.film = {.width = 99, .height = 99, .crop = {0, 0, 99, 99}};
+  job.camera = CameraName{"x"};
+  job.title = "t";
+  job.priority = 4;
+  job.limits.max_pixels = 1 << 20;
+  job.settings.integrator = Integrator::kPbgi;
+  job.settings.spp = 4;
+  job.settings.tile_px = 32;
+  job.settings.layers = {Layer::kBeauty};
+  EXPECT_EQ(BakeKey(job), BakeKey(SmallJob()));
+}
+
+TEST(CoreBaker, BakesAnAssetAndStopsWhenTold) {
+  TempFolder folder;
+  ASSERT_TRUE(WriteGltf(MakeCornellBox(), folder / "cornell.gltf").ok());
+  const auto asset = CollectAsset(folder / "cornell.gltf");
+  ASSERT_TRUE(asset.ok()) << asset.status();
+  const auto baker = MakeCoreBaker(1);
+  JobSpec spec = SmallJob();
+  spec.settings.light_samples = 1;
+  std::atomic<bool> cancel = false;
+  const auto result = baker->Bake(*asset, spec, cancel);
+  ASSERT_TRUE(result.ok()) << result.status();
+  EXPECT_GT(result->blobs.prepared_scene.size(), 0u);
+  EXPECT_GT(result->blobs.tree_topology.size(), 0u);
+  EXPECT_FALSE(result->cameras.empty());
+  EXPECT_FALSE(result->made_up_camera);
+  EXPECT_GT(result->stats.wall_seconds[static_cast<size_t>(Stage::kImport)], 0);
+  cancel = true;
+  EXPECT_TRUE(absl::IsCancelled(baker->Bake(*asset, spec, cancel).status()));
+}
+
+TEST(CoreBaker, ABrokenAssetIsThePersonsErrorNotOurs) {
+  AssetBundle asset;
+  asset.root = "a.gltf";
+  asset.files["a.gltf"] = Blob::FromString("{ not json");
+  std::atomic<bool> cancel = false;
+  EXPECT_TRUE(absl::IsInvalidArgument(MakeCoreBaker(1)->Bake(asset, SmallJob(), cancel).status()));
+}
+
+}  // namespace
+}  // namespace farpoint

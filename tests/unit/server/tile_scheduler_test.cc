@@ -1,0 +1,546 @@
+#include "server/tile_scheduler.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <random>
+
+namespace farpoint {
+namespace {
+
+using std::chrono::milliseconds;
+using std::chrono::seconds;
+using ::testing::HasSubstr;
+using ::testing::IsEmpty;
+
+Digest DigestOf(std::string_view text) { return Sha256().Update(text).Finish(); }
+
+class TileSchedulerTest : public ::testing::Test {
+ protected:
+  TileSchedulerTest() : scheduler_(options_, clock_) {}
+
+  void AddJob(const std::string& id, uint32_t tiles, int priority = 0) {
+    ScheduledJob job;
+    job.id = {id};
+    job.priority = priority;
+    job.number = ++number_;
+    job.tiles = tiles;
+    scheduler_.AddJob(job);
+  }
+  WorkerId AddWorker(const std::string& id, const std::string& fingerprint = "f") {
+    WorkerHello hello;
+    hello.fingerprint = DigestOf(fingerprint);
+    scheduler_.AddWorker({id}, hello);
+    return {id};
+  }
+  // Leases, commits; the tile's index.
+  uint32_t Render(const WorkerId& worker, Duration time = seconds(1)) {
+    const auto grant = scheduler_.Lease(worker);
+    EXPECT_TRUE(grant.has_value());
+    clock_.Advance(time);
+    EXPECT_TRUE(scheduler_.BeginCommit(worker, grant->lease, grant->attempt).ok());
+    EXPECT_TRUE(scheduler_.FinishCommit(grant->lease, true));
+    return grant->tile;
+  }
+  // Time passes and the worker is heard of, with progress or without.
+  void Beat(const LeaseGrant& grant, Duration time, bool progress) {
+    if (progress) ++counter_;
+    clock_.Advance(time);
+    scheduler_.Renew(grant.worker, grant.lease, {counter_, 0.5f});
+  }
+
+  SchedulerOptions options_;
+  FakeClock clock_;
+  TileScheduler scheduler_;
+  uint64_t number_ = 0;
+  uint64_t counter_ = 0;
+};
+
+TEST_F(TileSchedulerTest, HandsOutEachTileOnce) {
+  AddJob("a", 3);
+  const WorkerId w = AddWorker("w");
+  EXPECT_EQ(Render(w), 0u);
+  EXPECT_EQ(Render(w), 1u);
+  EXPECT_EQ(Render(w), 2u);
+  EXPECT_FALSE(scheduler_.Lease(w).has_value());
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.committed = 3, .total = 3}));
+}
+
+TEST_F(TileSchedulerTest, PriorityThenAge) {
+  AddJob("old", 1);
+  AddJob("new", 1);
+  AddJob("urgent", 1, 5);
+  const WorkerId w1 = AddWorker("1"), w2 = AddWorker("2"), w3 = AddWorker("3");
+  EXPECT_EQ(scheduler_.Lease(w1)->job, JobId{"urgent"});
+  EXPECT_EQ(scheduler_.Lease(w2)->job, JobId{"old"});
+  EXPECT_EQ(scheduler_.Lease(w3)->job, JobId{"new"});
+}
+
+TEST_F(TileSchedulerTest, CommittedTilesOfAnEarlierLifeAreNotRenderedAgain) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 4;
+  job.committed = {0, 2};
+  job.fingerprint = DigestOf("f");
+  scheduler_.AddJob(job);
+  const WorkerId w = AddWorker("w");
+  EXPECT_EQ(Render(w), 1u);
+  EXPECT_EQ(Render(w), 3u);
+  EXPECT_FALSE(scheduler_.Lease(w).has_value());
+}
+
+TEST_F(TileSchedulerTest, SilentWorkerLosesItsLease) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w"), other = AddWorker("other");
+  const auto grant = scheduler_.Lease(w);
+  clock_.Advance(options_.silence_time - milliseconds(1));
+  EXPECT_THAT(scheduler_.Tick().lost, IsEmpty());
+  clock_.Advance(milliseconds(1));
+  const SchedulerNews news = scheduler_.Tick();
+  ASSERT_EQ(news.lost.size(), 1u);
+  EXPECT_EQ(news.lost[0].grant.lease, grant->lease);
+  EXPECT_THAT(news.lost[0].reason, HasSubstr("nothing was heard"));
+  EXPECT_EQ(scheduler_.Reissued({"a"}), 1u);
+
+  const auto again = scheduler_.Lease(other);
+  ASSERT_TRUE(again.has_value());
+  EXPECT_EQ(again->attempt, 2u);
+  // The lost worker comes back: told to drop, its result refused and counted.
+  EXPECT_TRUE(scheduler_.Renew(w, grant->lease, {1, 0}).drop);
+  EXPECT_TRUE(
+      absl::IsFailedPrecondition(scheduler_.BeginCommit(w, grant->lease, grant->attempt).status()));
+  EXPECT_EQ(scheduler_.Refused({"a"}), 1u);
+  EXPECT_TRUE(scheduler_.BeginCommit(other, again->lease, again->attempt).ok());
+  EXPECT_TRUE(scheduler_.FinishCommit(again->lease, true));
+}
+
+TEST_F(TileSchedulerTest, OnlyProgressKeepsALeaseAlive) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  for (Duration t{}; t < options_.lease_time * 3; t += seconds(2)) {
+    Beat(*grant, seconds(2), true);
+    ASSERT_THAT(scheduler_.Tick().lost, IsEmpty());
+  }
+  for (Duration t{}; t < options_.lease_time - seconds(2); t += seconds(2)) {
+    Beat(*grant, seconds(2), false);
+    ASSERT_THAT(scheduler_.Tick().lost, IsEmpty());
+  }
+  Beat(*grant, seconds(2), false);
+  const SchedulerNews news = scheduler_.Tick();
+  ASSERT_EQ(news.lost.size(), 1u);
+  EXPECT_THAT(news.lost[0].reason, HasSubstr("no progress"));
+}
+
+TEST_F(TileSchedulerTest, AJobMayHaveLongerLeases) {
+  ScheduledJob job;
+  job.id = {"slow"};
+  job.tiles = 1;
+  job.lease_time = options_.lease_time * 10;
+  scheduler_.AddJob(job);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  for (Duration t{}; t < options_.lease_time * 9; t += seconds(4)) {
+    Beat(*grant, seconds(4), false);
+    ASSERT_THAT(scheduler_.Tick().lost, IsEmpty());
+  }
+}
+
+TEST_F(TileSchedulerTest, GivenBackTilesBlameNobody) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w");
+  for (int i = 0; i < 20; ++i) {
+    const auto grant = scheduler_.Lease(w);
+    ASSERT_TRUE(grant.has_value()) << i;
+    EXPECT_THAT(scheduler_.ReportFailure(w, grant->lease, true, absl::OkStatus()).failed,
+                IsEmpty());
+  }
+  EXPECT_EQ(scheduler_.Workers()[0].failures, 0u);
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.queued = 1, .total = 1}));
+}
+
+TEST_F(TileSchedulerTest, TileThatKillsThreeWorkersFailsItsJob) {
+  AddJob("a", 2);
+  for (int i = 0; i < 3; ++i) {
+    const WorkerId w = AddWorker("w" + std::to_string(i));
+    const auto grant = scheduler_.Lease(w);
+    ASSERT_TRUE(grant.has_value());
+    EXPECT_EQ(grant->tile, 0u);
+    clock_.Advance(options_.silence_time);
+    const SchedulerNews news = scheduler_.Tick();
+    ASSERT_EQ(news.lost.size(), 1u);
+    if (i < 2) {
+      ASSERT_THAT(news.failed, IsEmpty());
+      continue;
+    }
+    ASSERT_EQ(news.failed.size(), 1u);
+    EXPECT_EQ(news.failed[0].job, JobId{"a"});
+    EXPECT_THAT(std::string(news.failed[0].error.message()), HasSubstr("tile 0"));
+    EXPECT_THAT(std::string(news.failed[0].error.message()), HasSubstr("nothing was heard"));
+  }
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.failed = 2, .total = 2}));
+  EXPECT_FALSE(scheduler_.Lease(AddWorker("new")).has_value());
+}
+
+TEST_F(TileSchedulerTest, AFailedTileGoesToAnotherWorkerIfThereIsOne) {
+  AddJob("a", 2);
+  const WorkerId w1 = AddWorker("1");
+  const auto first = scheduler_.Lease(w1);
+  scheduler_.ReportFailure(w1, first->lease, false, absl::InternalError("boom"));
+  const WorkerId w2 = AddWorker("2");
+  EXPECT_EQ(scheduler_.Lease(w1)->tile, 1u);
+  EXPECT_EQ(scheduler_.Lease(w2)->tile, 0u);
+}
+
+TEST_F(TileSchedulerTest, OneWorkerAloneTriesAgainUntilTheTileFails) {
+  options_.max_worker_failures = 1000;
+  TileScheduler scheduler(options_, clock_);
+  scheduler.AddJob({.id = {"a"}, .tiles = 1});
+  scheduler.AddWorker({"w"}, {});
+  for (uint32_t i = 1; i <= options_.max_tile_failures; ++i) {
+    const auto grant = scheduler.Lease({"w"});
+    ASSERT_TRUE(grant.has_value()) << i;
+    const SchedulerNews news =
+        scheduler.ReportFailure({"w"}, grant->lease, false, absl::InternalError("boom"));
+    EXPECT_EQ(news.failed.size(), i == options_.max_tile_failures ? 1u : 0u) << i;
+  }
+}
+
+TEST_F(TileSchedulerTest, PermanentErrorsFailTheJobAtOnce) {
+  AddJob("a", 2);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  const SchedulerNews news =
+      scheduler_.ReportFailure(w, grant->lease, false, absl::InvalidArgumentError("bad scene"));
+  ASSERT_EQ(news.failed.size(), 1u);
+  EXPECT_TRUE(absl::IsInvalidArgument(news.failed[0].error));
+  EXPECT_THAT(std::string(news.failed[0].error.message()), HasSubstr("bad scene"));
+}
+
+TEST_F(TileSchedulerTest, AWorkerThatFailsRepeatedlyIsSetAsideForAWhile) {
+  AddJob("a", 10);
+  const WorkerId w = AddWorker("w");
+  AddWorker("other");
+  for (uint32_t i = 0; i < options_.max_worker_failures; ++i) {
+    const auto grant = scheduler_.Lease(w);
+    ASSERT_TRUE(grant.has_value()) << i;
+    scheduler_.ReportFailure(w, grant->lease, false, absl::InternalError("boom"));
+  }
+  EXPECT_FALSE(scheduler_.Lease(w).has_value());
+  EXPECT_TRUE(scheduler_.Lease({"other"}).has_value());
+  clock_.Advance(options_.set_aside_time);
+  EXPECT_TRUE(scheduler_.Lease(w).has_value());
+}
+
+TEST_F(TileSchedulerTest, SuccessClearsAWorkersFailures) {
+  AddJob("a", 100);
+  const WorkerId w = AddWorker("w");
+  for (uint32_t i = 0; i < 5 * options_.max_worker_failures; ++i) {
+    for (uint32_t k = 1; k < options_.max_worker_failures; ++k) {
+      // A tile fails at most max_tile_failures times, so other tiles' turn must come.
+      AddJob("b" + std::to_string(i) + "-" + std::to_string(k), 1, 1);
+      const auto grant = scheduler_.Lease(w);
+      scheduler_.ReportFailure(w, grant->lease, false, absl::InternalError("boom"));
+      scheduler_.RemoveJob(grant->job);
+    }
+    Render(w);
+    ASSERT_FALSE(scheduler_.Workers()[0].set_aside);
+  }
+}
+
+TEST_F(TileSchedulerTest, ASlowTileIsCopiedAndTheFirstResultWins) {
+  AddJob("a", 5);
+  const WorkerId slow = AddWorker("slow"), fast = AddWorker("fast");
+  const auto original = scheduler_.Lease(slow);
+  for (int i = 0; i < 4; ++i) {
+    Render(fast, seconds(1));
+    scheduler_.Renew(slow, original->lease, {++counter_, 0.1f});
+  }
+  EXPECT_FALSE(scheduler_.Lease(fast).has_value());  // not slow enough yet
+  for (int i = 0; i < 3; ++i) Beat(*original, seconds(2), true);
+  const auto copy = scheduler_.Lease(fast);
+  ASSERT_TRUE(copy.has_value());
+  EXPECT_TRUE(copy->speculative);
+  EXPECT_EQ(copy->tile, original->tile);
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.leased = 1, .committed = 4, .total = 5}));
+  EXPECT_FALSE(scheduler_.Lease(AddWorker("third")).has_value());  // one copy is enough
+
+  ASSERT_TRUE(scheduler_.BeginCommit(fast, copy->lease, copy->attempt).ok());
+  // The original arrives while the copy is being stored.
+  EXPECT_FALSE(scheduler_.BeginCommit(slow, original->lease, original->attempt).ok());
+  EXPECT_TRUE(scheduler_.FinishCommit(copy->lease, true));
+  EXPECT_TRUE(scheduler_.Renew(slow, original->lease, {++counter_, 0.5f}).drop);
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.committed = 5, .total = 5}));
+  EXPECT_EQ(scheduler_.Refused({"a"}), 1u);
+}
+
+TEST_F(TileSchedulerTest, ACopySurvivesTheLossOfTheOriginal) {
+  AddJob("a", 2);
+  const WorkerId slow = AddWorker("slow"), fast = AddWorker("fast");
+  const auto original = scheduler_.Lease(slow);
+  Render(fast, seconds(1));
+  for (int i = 0; i < 5; ++i) Beat(*original, seconds(2), true);
+  const auto copy = scheduler_.Lease(fast);
+  ASSERT_TRUE(copy.has_value());
+  scheduler_.ReportFailure(slow, original->lease, false, absl::InternalError("boom"));
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.leased = 1, .committed = 1, .total = 2}));
+  EXPECT_TRUE(scheduler_.BeginCommit(fast, copy->lease, copy->attempt).ok());
+  EXPECT_TRUE(scheduler_.FinishCommit(copy->lease, true));
+}
+
+TEST_F(TileSchedulerTest, TheFirstCommittedTileDecidesTheFingerprint) {
+  AddJob("a", 3);
+  const WorkerId x = AddWorker("x", "fx"), y = AddWorker("y", "fy");
+  const auto of_x = scheduler_.Lease(x);
+  const auto of_y = scheduler_.Lease(y);
+  ASSERT_TRUE(of_x && of_y);
+  ASSERT_TRUE(scheduler_.BeginCommit(y, of_y->lease, 1).ok());
+  // Both stored at a time would be two fingerprints in one image.
+  EXPECT_FALSE(scheduler_.BeginCommit(x, of_x->lease, 1).ok());
+  ASSERT_TRUE(scheduler_.FinishCommit(of_y->lease, true));
+  EXPECT_TRUE(scheduler_.Renew(x, of_x->lease, {1, 0}).drop);
+  EXPECT_FALSE(scheduler_.Lease(x).has_value());
+  EXPECT_TRUE(scheduler_.Lease(y).has_value());
+}
+
+TEST_F(TileSchedulerTest, AFirstResultThatWasNotStoredDecidesNothing) {
+  AddJob("a", 2);
+  const WorkerId x = AddWorker("x", "fx"), y = AddWorker("y", "fy");
+  auto grant = scheduler_.Lease(x);
+  ASSERT_TRUE(scheduler_.BeginCommit(x, grant->lease, 1).ok());
+  ASSERT_TRUE(scheduler_.FinishCommit(grant->lease, false));
+  grant = scheduler_.Lease(x);
+  ASSERT_TRUE(scheduler_.BeginCommit(x, grant->lease, 2).ok());
+  EXPECT_EQ(scheduler_.RefuseResult(grant->lease, "wrong hash").lost.size(), 1u);
+  EXPECT_EQ(scheduler_.Refused({"a"}), 1u);
+  EXPECT_TRUE(scheduler_.Lease(y).has_value());
+}
+
+TEST_F(TileSchedulerTest, ResultsOfTheWrongAttemptOrWorkerAreRefused) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w"), thief = AddWorker("thief");
+  const auto grant = scheduler_.Lease(w);
+  EXPECT_FALSE(scheduler_.BeginCommit(w, grant->lease, 2).ok());
+  EXPECT_FALSE(scheduler_.BeginCommit(thief, grant->lease, 1).ok());
+  EXPECT_FALSE(scheduler_.BeginCommit(w, {"invented"}, 1).ok());
+  EXPECT_EQ(scheduler_.Refused({"a"}), 2u);
+  EXPECT_TRUE(scheduler_.BeginCommit(w, grant->lease, 1).ok());
+}
+
+TEST_F(TileSchedulerTest, AskingAgainMeansThatTheLastAnswerWasLost) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w");
+  const auto lost = scheduler_.Lease(w);
+  const auto again = scheduler_.Lease(w);
+  ASSERT_TRUE(again.has_value());
+  EXPECT_NE(lost->lease, again->lease);
+  EXPECT_EQ(scheduler_.ActiveLeases(), 1u);
+  EXPECT_EQ(scheduler_.Workers()[0].failures, 0u);
+}
+
+TEST_F(TileSchedulerTest, AWorkerThatLeavesWhileItsResultIsStoredStillCounts) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  ASSERT_TRUE(scheduler_.BeginCommit(w, grant->lease, 1).ok());
+  scheduler_.RemoveWorker(w);
+  EXPECT_TRUE(scheduler_.FinishCommit(grant->lease, true));
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.committed = 1, .total = 1}));
+}
+
+TEST_F(TileSchedulerTest, AnEndedJobTakesItsLeasesWithIt) {
+  AddJob("a", 2);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  ASSERT_TRUE(scheduler_.BeginCommit(w, grant->lease, 1).ok());
+  scheduler_.RemoveJob({"a"});
+  EXPECT_FALSE(scheduler_.FinishCommit(grant->lease, true));
+  EXPECT_EQ(scheduler_.ActiveLeases(), 0u);
+  EXPECT_TRUE(scheduler_.Renew(w, grant->lease, {1, 0}).drop);
+}
+
+TEST_F(TileSchedulerTest, AJobThatRunsTooLongFails) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 2;
+  job.max_time = seconds(10);
+  scheduler_.AddJob(job);
+  clock_.Advance(seconds(60));  // waiting does not count
+  EXPECT_THAT(scheduler_.Tick().failed, IsEmpty());
+  const WorkerId w = AddWorker("w");
+  Render(w, seconds(9));
+  EXPECT_THAT(scheduler_.Tick().failed, IsEmpty());
+  clock_.Advance(seconds(2));
+  const SchedulerNews news = scheduler_.Tick();
+  ASSERT_EQ(news.failed.size(), 1u);
+  EXPECT_TRUE(absl::IsDeadlineExceeded(news.failed[0].error));
+}
+
+TEST_F(TileSchedulerTest, SilentIdleWorkersAreForgotten) {
+  AddWorker("w");
+  clock_.Advance(options_.forget_worker_after);
+  EXPECT_EQ(scheduler_.Tick().forgotten.size(), 1u);
+  EXPECT_FALSE(scheduler_.HasWorker({"w"}));
+}
+
+TEST_F(TileSchedulerTest, ProgressAndEtaFollowTheTiles) {
+  AddJob("a", 4);
+  const WorkerId w = AddWorker("w");
+  EXPECT_EQ(scheduler_.EtaSeconds({"a"}), std::nullopt);
+  Render(w, seconds(10));
+  EXPECT_DOUBLE_EQ(scheduler_.Progress({"a"}), 0.25);
+  EXPECT_DOUBLE_EQ(*scheduler_.EtaSeconds({"a"}), 30);
+  const auto grant = scheduler_.Lease(w);
+  scheduler_.Renew(w, grant->lease, {1, 0.5f});
+  EXPECT_DOUBLE_EQ(scheduler_.Progress({"a"}), 0.375);
+}
+
+// Whatever happens in whatever order: the tiles add up, a tile is committed once, and in the end
+// all are.
+class RandomEvents : public ::testing::TestWithParam<uint32_t> {};
+
+TEST_P(RandomEvents, KeepTheInvariants) {
+  std::mt19937 random(GetParam());
+  SchedulerOptions options;
+  options.max_dead_workers = 1000000;  // no job shall fail here
+  options.max_tile_failures = 1000000;
+  FakeClock clock;
+  TileScheduler scheduler(options, clock);
+  struct Held {
+    LeaseGrant grant;
+    bool committing = false;
+  };
+  std::map<JobId, uint32_t> totals;
+  std::map<JobId, std::map<uint32_t, int>> commits;
+  std::vector<Held> held;  // live or stale: workers do not know
+  std::vector<WorkerId> workers;
+  uint32_t next_worker = 0, next_job = 0;
+  uint64_t counter = 0;
+  const auto add_worker = [&] {
+    workers.push_back({"w" + std::to_string(next_worker++)});
+    WorkerHello hello;
+    hello.fingerprint = DigestOf(next_worker % 5 == 0 ? "odd" : "usual");
+    scheduler.AddWorker(workers.back(), hello);
+  };
+  const auto add_job = [&] {
+    ScheduledJob job;
+    job.id = {"j" + std::to_string(next_job++)};
+    job.number = next_job;
+    job.priority = static_cast<int>(random() % 3);
+    job.tiles = 1 + random() % 12;
+    totals[job.id] = job.tiles;
+    scheduler.AddJob(job);
+  };
+  const auto check = [&] {
+    uint32_t leased = 0;
+    for (const auto& [id, total] : totals) {
+      const TileCounts c = scheduler.Counts(id);
+      ASSERT_EQ(c.total, total);
+      ASSERT_EQ(c.queued + c.leased + c.committed + c.failed, total);
+      ASSERT_EQ(c.failed, 0u);
+      ASSERT_EQ(c.committed, commits[id].size());
+      leased += c.leased;
+    }
+    ASSERT_GE(scheduler.ActiveLeases(), leased);
+    ASSERT_LE(scheduler.ActiveLeases(), 2 * leased);
+  };
+  add_worker();
+  add_job();
+  const auto finish = [&](Held& h, bool durable) {
+    if (scheduler.FinishCommit(h.grant.lease, durable) && durable) {
+      ASSERT_EQ(++commits[h.grant.job][h.grant.tile], 1) << "committed twice";
+    }
+  };
+  for (int step = 0; step < 4000; ++step) {
+    switch (random() % 12) {
+      case 0:
+        if (workers.size() < 8) add_worker();
+        break;
+      case 1:
+        if (totals.size() < 5) add_job();
+        break;
+      case 2:
+        clock.Advance(milliseconds(random() % 4000));
+        break;
+      case 3: {
+        const SchedulerNews news = scheduler.Tick();
+        ASSERT_TRUE(news.failed.empty());
+        for (const WorkerId& w : news.forgotten) std::erase(workers, w);
+        break;
+      }
+      case 4:
+        if (!workers.empty() && random() % 8 == 0) {
+          const size_t i = random() % workers.size();
+          scheduler.RemoveWorker(workers[i]);
+          workers.erase(workers.begin() + static_cast<ptrdiff_t>(i));
+        }
+        break;
+      case 5:
+      case 6:
+        if (!workers.empty()) {
+          if (const auto grant = scheduler.Lease(workers[random() % workers.size()])) {
+            held.push_back({*grant});
+          }
+        }
+        break;
+      case 7:
+        if (!totals.empty() && random() % 40 == 0) {
+          const JobId id = std::next(totals.begin(), random() % totals.size())->first;
+          scheduler.RemoveJob(id);
+          totals.erase(id);
+          commits.erase(id);
+        }
+        break;
+      default:
+        if (!held.empty()) {
+          const size_t i = random() % held.size();
+          Held& h = held[i];
+          const auto drop = [&] { held.erase(held.begin() + static_cast<ptrdiff_t>(i)); };
+          if (h.committing) {
+            finish(h, random() % 5 != 0);
+            drop();
+            break;
+          }
+          switch (random() % 6) {
+            case 0:
+              scheduler.ReportFailure(h.grant.worker, h.grant.lease, random() % 2 == 0,
+                                      absl::InternalError("boom"));
+              if (random() % 2 == 0) drop();  // else it will come again, stale
+              break;
+            case 1:
+            case 2:
+              scheduler.Renew(h.grant.worker, h.grant.lease, {++counter, 0.5f});
+              break;
+            default:
+              h.committing =
+                  scheduler.BeginCommit(h.grant.worker, h.grant.lease, h.grant.attempt).ok();
+              if (!h.committing && random() % 2 == 0) drop();
+          }
+        }
+    }
+    ASSERT_NO_FATAL_FAILURE(check()) << "step " << step;
+  }
+  // Everything comes to an end: what hangs is finished, then good workers do the rest.
+  for (Held& h : held) {
+    if (h.committing) finish(h, true);
+  }
+  clock.Advance(std::chrono::hours(1));
+  scheduler.Tick();
+  scheduler.AddWorker({"good-usual"}, {.fingerprint = DigestOf("usual")});
+  scheduler.AddWorker({"good-odd"}, {.fingerprint = DigestOf("odd")});
+  for (const WorkerId& w : {WorkerId{"good-usual"}, WorkerId{"good-odd"}}) {
+    while (const auto grant = scheduler.Lease(w)) {
+      ASSERT_TRUE(scheduler.BeginCommit(w, grant->lease, grant->attempt).ok());
+      Held h{*grant};
+      finish(h, true);
+      ASSERT_NO_FATAL_FAILURE(check());
+    }
+  }
+  for (const auto& [id, total] : totals) EXPECT_EQ(scheduler.Counts(id).committed, total);
+  EXPECT_EQ(scheduler.ActiveLeases(), 0u);
+}
+
+INSTANTIATE_TEST_SUITE_P(Seeds, RandomEvents, ::testing::Range(1u, 33u));
+
+}  // namespace
+}  // namespace farpoint
