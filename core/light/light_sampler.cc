@@ -25,7 +25,84 @@ float RangeWindow(const PreparedLight& light, float d_m) {
   return std::clamp(1.0f - q2 * q2, 0.0f, 1.0f);
 }
 
+// A triangle that fills less than this is sampled by area: its solid angle, a difference of
+// angles, would lose its digits, and over so little the two densities are the same.
+constexpr double kSmallSolidAngle = 1e-3;
+
 }  // namespace
+
+// By solid angle (Arvo 1995, "Stratified Sampling of Spherical Triangles"): bounded however near
+// the emitter comes, where sampling by area has the unbounded factor cosθ_l / d².
+std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitter& e,
+                                                                    const Vec3f& p, float u,
+                                                                    float v) const {
+  const Vec3d origin(p);
+  const Vec3d corner[3] = {Vec3d(e.v0) - origin, Vec3d(e.v0 + e.e1) - origin,
+                           Vec3d(e.v0 + e.e2) - origin};
+  const double length[3] = {Length(corner[0]), Length(corner[1]), Length(corner[2])};
+  const double height = Dot(corner[0], Vec3d(e.normal));  // of the plane over p, signed
+  if (!(length[0] > 0) || !(length[1] > 0) || !(length[2] > 0) || height == 0.0) {
+    return std::nullopt;  // at a corner, or in the triangle's plane: nothing arrives
+  }
+  const Vec3d a = corner[0] / length[0], b = corner[1] / length[1], c = corner[2] / length[2];
+  const double triple = std::fabs(Dot(a, Cross(b, c)));
+  const double solid_angle =
+      2.0 * DetAtan2(triple, 1.0 + Dot(a, b) + Dot(b, c) + Dot(c, a));
+  EmitterPoint out;
+  if (!(solid_angle > kSmallSolidAngle)) {
+    const Vec2f bary = UniformTriangle(u, v);
+    const Vec3d q = corner[0] + Vec3d(e.e1) * static_cast<double>(bary.x) +
+                    Vec3d(e.e2) * static_cast<double>(bary.y);
+    const double d2 = Length2(q), d = std::sqrt(d2);
+    if (!(d > 0)) return std::nullopt;
+    out.direction = Vec3f(q / d);
+    out.distance_m = static_cast<float>(d);
+    out.b1 = bary.x;
+    out.b2 = bary.y;
+    out.inverse_pdf_sr =
+        static_cast<float>(std::fabs(Dot(q, Vec3d(e.normal))) / (d * d2) * e.area_m2);
+    return out;
+  }
+  // Interior angles at the corners, from the planes of the great circles.
+  const Vec3d n_ab = Cross(a, b), n_ca = Cross(c, a);
+  const auto angle = [](const Vec3d& m, const Vec3d& n) {
+    return DetAtan2(Length(Cross(m, n)), -Dot(m, n));
+  };
+  const double alpha = angle(n_ab, n_ca);
+  const double cos_alpha = DetSinCos(alpha).cos, sin_alpha = DetSinCos(alpha).sin;
+  const double cos_c = Dot(a, b);  // arc opposite to corner c
+  // The sub-triangle of area u Ω: its third corner lies on the arc from a to c.
+  const SinCos phi = DetSinCos(u * solid_angle - alpha);
+  const double uu = phi.cos - cos_alpha;
+  const double vv = phi.sin + sin_alpha * cos_c;
+  const double denominator = (vv * phi.sin + uu * phi.cos) * sin_alpha;
+  const double q = denominator != 0.0
+                       ? std::clamp(((vv * phi.cos - uu * phi.sin) * cos_alpha - vv) / denominator,
+                                    -1.0, 1.0)
+                       : 1.0;
+  const Vec3d toward_c = NormalizeOr(c - a * Dot(c, a), a);
+  const Vec3d c_hat = a * q + toward_c * std::sqrt(std::max(0.0, 1.0 - q * q));
+  const double z = 1.0 - static_cast<double>(v) * (1.0 - Dot(c_hat, b));
+  const Vec3d w = Normalize(b * z + NormalizeOr(c_hat - b * Dot(c_hat, b), c_hat) *
+                                        std::sqrt(std::max(0.0, 1.0 - z * z)));
+  // Where the direction meets the triangle's plane.
+  const double cos_l = Dot(w, Vec3d(e.normal));
+  if (!(cos_l * height > 0.0)) return std::nullopt;
+  const double distance = height / cos_l;
+  const Vec3d at = w * distance - corner[0];
+  const Vec3d e1(e.e1), e2(e.e2);
+  const double d11 = Dot(e1, e1), d12 = Dot(e1, e2), d22 = Dot(e2, e2);
+  const double det = d11 * d22 - d12 * d12;
+  if (!(det > 0.0)) return std::nullopt;
+  out.b1 = static_cast<float>(
+      std::clamp((Dot(at, e1) * d22 - Dot(at, e2) * d12) / det, 0.0, 1.0));
+  out.b2 = static_cast<float>(
+      std::clamp((Dot(at, e2) * d11 - Dot(at, e1) * d12) / det, 0.0, 1.0));
+  out.direction = Vec3f(w);
+  out.distance_m = static_cast<float>(distance);
+  out.inverse_pdf_sr = static_cast<float>(solid_angle);
+  return out;
+}
 
 LightSampler::LightSampler(std::shared_ptr<const RayAccel> accel) : accel_(std::move(accel)) {
   const PreparedScene& scene = accel_->scene();
@@ -111,24 +188,20 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
                                        [](float x, const Emitter& e) { return x < e.cdf_below; });
       const Emitter& e = it == emitters_.begin() ? emitters_.front() : *(it - 1);
       u = std::clamp((u - e.cdf_below) / e.probability, 0.0f, 0.99999994f);
-      const Vec2f b = UniformTriangle(u, v);
-      const Vec3f q = e.v0 + e.e1 * b.x + e.e2 * b.y;
-      const Vec3f d = q - origin;
-      const float d2 = Length2(d);
-      const float distance = std::sqrt(d2);
-      const float cos_p = Dot(n, d);                    // times distance
-      const float cos_l = std::fabs(Dot(e.normal, d));  // times distance
-      if (!(cos_p > 0.0f) || !(Dot(ng, d) > 0.0f) || !(cos_l > 0.0f) || !(d2 > 0.0f)) {
+      ++counters.samples;
+      const std::optional<EmitterPoint> point = SamplePoint(e, origin, u, v);
+      if (!point) continue;
+      const float cos_p = Dot(n, point->direction);
+      if (!(cos_p > 0.0f) || !(Dot(ng, point->direction) > 0.0f)) {
         ++counters.skipped_facing_away;
         continue;
       }
+      const float reach_m = point->distance_m - 2.0f * accel_->surface_offset_m();
       ++counters.rays;
-      if (accel_->Occluded(origin, d, 1.0f - 2.0f * accel_->surface_offset_m() / distance)) {
-        continue;
-      }
-      const Rgb radiance = e.textured ? scene.Surface(e.triangle, b.x, b.y).emission
+      if (reach_m > 0.0f && accel_->Occluded(origin, point->direction, reach_m)) continue;
+      const Rgb radiance = e.textured ? scene.Surface(e.triangle, point->b1, point->b2).emission
                                       : scene.MaterialOf(e.triangle).emission;
-      sum += radiance * ((cos_p / d2) * (cos_l / d2) * (e.area_m2 / e.probability));
+      sum += radiance * (cos_p * point->inverse_pdf_sr / e.probability);
     }
     irradiance += sum / static_cast<float>(samples);
   }

@@ -7,6 +7,7 @@
 
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <vector>
 
 #include "core/accel/ray_accel.h"
@@ -17,6 +18,7 @@ namespace farpoint {
 // Which shadow rays an estimate took and saved.
 struct LightCounters {
   uint64_t rays = 0;
+  uint64_t samples = 0;              // points drawn on emitters
   uint64_t skipped_facing_away = 0;  // light behind the surface or out of its range or cone
 };
 
@@ -32,8 +34,8 @@ class LightSampler {
 
   // An unbiased estimate of the irradiance [W/m²] at surface point `p` (relative to the scene's
   // origin) on the side of unit geometric normal `ng`, against shading normal `n`
-  // (Dot(n, ng) >= 0): `samples` shadow rays to the emitters, chosen by power and stratified
-  // (Owen-scrambled Sobol' in two dimensions), `samples` to the sky by the cosine, one to each
+  // (Dot(n, ng) >= 0): `samples` shadow rays to the emitters, chosen by power, then by
+  // solid angle, and stratified (Owen-scrambled Sobol' in two dimensions), `samples` to the sky by the cosine, one to each
   // punctual light. `first_index` is the index of the first sample within its sequence and `key`
   // names the sequence: the same key with disjoint aligned index ranges gives one stratified set.
   // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
@@ -51,6 +53,17 @@ class LightSampler {
     float cdf_below;    // sum of the probabilities before it
     bool textured;
   };
+
+  // A direction to a point of an emitter, as drawn.
+  struct EmitterPoint {
+    Vec3f direction;  // unit, world
+    float distance_m;
+    float b1, b2;           // where on the triangle
+    float inverse_pdf_sr;   // 1 / density per solid angle, given the emitter
+  };
+  // (u, v) in [0, 1)² -> a direction from p; none where the emitter is seen edge-on.
+  std::optional<EmitterPoint> SamplePoint(const Emitter& e, const Vec3f& p, float u,
+                                          float v) const;
 
   std::shared_ptr<const RayAccel> accel_;
   std::vector<Emitter> emitters_;

@@ -62,8 +62,10 @@ void RasterizeCut(const PointTree& tree, const CutView& view, std::span<const Cu
 
 // Irradiance [W/m²] at a receiver of normal `n` (world; ignored for the cosine map, whose frame is
 // the receiver's) from `far` seen through `near` (may be null):
-//   E = pi Σ w L / Σ w,   w = max(0, n·V_pixel),   L = L_near + (1 - C_near) L_far
-// with opaque splats composed by depth instead: the nearer of the two wins. A sum over all pixels
+//   E = pi Σ w L / Σ w,   w = max(0, n·V_pixel),   L = L_near + min(1, (1 - C_near) / C_far) L_far
+// with coverage C = C_near + C_far, L divided by C where C > 0.75 (a pixel covered for the most
+// part is full: splats leave gaps), and the far part cut to the room that is left. Opaque splats
+// are composed by depth instead: the nearer of the two wins. A sum over all pixels
 // in a fixed order. The quotient makes a buffer of constant radiance exact for every normal.
 Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f& n, Splat splat);
 

@@ -53,6 +53,14 @@ bool OnlyInvisibleSides(const LiteralNode& n, const CutView& view) {
   return (-facing > slack && front <= 0) || (facing > slack && back <= 0);
 }
 
+CutNode MakeNode(const LiteralNode& n, const CutView& view, uint32_t slot, const Vec3d& v,
+                 double d) {
+  const double cosine = -Dot(n.mean, v) / d;  // > 0: the front is seen
+  double area = cosine > 0 ? n.front_area : n.back_area;
+  if (view.sees_inside) area = std::max(n.front_area, n.back_area);
+  return {slot, static_cast<float>(d), Vec3f(v / d), static_cast<float>(area * cosine / (d * d))};
+}
+
 void Visit(const PointTree& tree, const CutView& view, const CutParams& params, uint32_t slot,
            int level, std::vector<CutNode>& far, std::vector<NearNode>* near) {
   const LiteralNode n = ReadNode(tree, slot);
@@ -77,16 +85,16 @@ void Visit(const PointTree& tree, const CutView& view, const CutParams& params, 
   if (level == 0) {
     const bool own = std::fabs(Dot(n.mean, v)) < 0.6 * n.radius &&
                      std::fabs(Dot(n.mean, Vec3d(view.normal))) > 0.5;
-    if (!own) far.push_back({slot, static_cast<float>(d)});
+    if (!own && d > 0) far.push_back(MakeNode(n, view, slot, v, d));
     return;
   }
   double pixel_sr = params.pixel_sr;
   if (params.map == BufferMap::kCosine) {
     pixel_sr /= std::max(0.1, Dot(Vec3d(view.normal), v) / d);
   }
-  const bool fine = kPi * n.radius * n.radius <= pixel_sr * d * d && Length2(n.mean) >= 0.5;
+  const bool fine = kPi * n.radius * n.radius <= kCutPixels * pixel_sr * d * d && Length2(n.mean) >= 0.5;
   if (fine) {
-    far.push_back({slot, static_cast<float>(d)});
+    far.push_back(MakeNode(n, view, slot, v, d));
     return;
   }
   for (uint32_t k = 0; k < kLanes; ++k) {
@@ -114,6 +122,7 @@ Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const
     const Vec3d v(map.weight(0)[p], map.weight(1)[p], map.weight(2)[p]);
     const double w = std::max(0.0, Dot(axis, v));
     Vec3d l(far.radiance(0)[p], far.radiance(1)[p], far.radiance(2)[p]);
+    double covered = far.coverage()[p];
     if (near != nullptr) {
       const Vec3d own(near->radiance(0)[p], near->radiance(1)[p], near->radiance(2)[p]);
       if (splat == Splat::kOpaque) {
@@ -121,8 +130,10 @@ Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const
       } else {
         const double open = 1.0 - near->coverage()[p], c = far.coverage()[p];
         l = own + l * (c > open ? open / c : 1.0);
+        covered = std::min(1.0, near->coverage()[p] + c);
       }
     }
+    if (splat == Splat::kCoverage && covered > 0.75) l = l / covered;
     weights += w;
     sum += l * w;
   }

@@ -107,11 +107,11 @@ void MakeParentRadiance(const NodeGroup& g, const RadianceGroup& r, uint32_t cou
   for (int c = 0; c < 3; ++c) {
     double front = 0, back = 0;
     for (uint32_t k = 0; k < count; ++k) {
-      front += static_cast<double>(g.front_area[k]) * r.front[c][k];
-      back += static_cast<double>(g.back_area[k]) * r.back[c][k];
+      front += static_cast<double>(g.front_area[k]) * r.lane[k].front[c];
+      back += static_cast<double>(g.back_area[k]) * r.lane[k].back[c];
     }
-    out.front[c][lane] = front_area > 0 ? static_cast<float>(front / front_area) : 0.0f;
-    out.back[c][lane] = back_area > 0 ? static_cast<float>(back / back_area) : 0.0f;
+    out.lane[lane].front[c] = front_area > 0 ? static_cast<float>(front / front_area) : 0.0f;
+    out.lane[lane].back[c] = back_area > 0 ? static_cast<float>(back / back_area) : 0.0f;
   }
 }
 
@@ -233,10 +233,7 @@ PointTree::Blobs PointTree::Build(const SurfelCloud& cloud, const SurfelShading&
         g.area[k] = area;
         g.front_area[k] = front ? area : 0.0f;
         g.back_area[k] = back ? area : 0.0f;
-        for (int c = 0; c < 3; ++c) {
-          r.front[c][k] = shading.front[i][c];
-          r.back[c][k] = shading.back[i][c];
-        }
+        r.lane[k] = {shading.front[i], shading.back[i]};
         BuildNode& b = below[at];
         b = BuildNode{};
         b.centres.Extend(p);
@@ -350,11 +347,11 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
     }
   }
   for (const RadianceGroup& r : tree->radiance_) {
-    for (int c = 0; c < 3; ++c) {
-      for (uint32_t k = 0; k < kLanes; ++k) {
-        sane &= (r.front[c][k] >= 0) & std::isfinite(r.front[c][k]) & (r.back[c][k] >= 0) &
-                std::isfinite(r.back[c][k]);
-        lit |= (r.front[c][k] > 0) | (r.back[c][k] > 0);
+    for (const RadianceGroup::Sides& sides : r.lane) {
+      for (int c = 0; c < 3; ++c) {
+        const float front = sides.front[c], back = sides.back[c];
+        sane &= (front >= 0) & std::isfinite(front) & (back >= 0) & std::isfinite(back);
+        lit |= (front > 0) | (back > 0);
       }
     }
   }

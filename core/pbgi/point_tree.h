@@ -42,8 +42,9 @@ static_assert(sizeof(NodeGroup) == 384);
 // What the nodes of a group reflect to the front (towards +n) and to the back: means weighted by
 // visible area.
 struct alignas(32) RadianceGroup {
-  float front[3][kLanes];  // [channel][lane]
-  float back[3][kLanes];
+  struct Sides {
+    Rgb front, back;
+  } lane[kLanes];
 };
 static_assert(sizeof(RadianceGroup) == 192);
 

@@ -27,8 +27,35 @@ struct Verdict {
   unsigned splat = 0;    // take the node as it is
   unsigned descend = 0;
   unsigned near = 0;     // stop here, receivers go on
-  F8 distance;
+  F8 dx, dy, dz, distance;  // from the view to the centre
+  F8 facing;                // mean normal · (dx, dy, dz)
 };
+
+// Appends the lanes of `mask` to the cut.
+void Append(const NodeGroup& g, const Verdict& verdict, unsigned mask, bool sees_inside,
+            const uint32_t* slots, uint32_t first_slot, std::vector<CutNode>& cut) {
+  const F8 zero = Set8(0.0f);
+  const F8 inverse = Set8(1.0f) / verdict.distance;
+  const F8 front_area = Load8(g.front_area), back_area = Load8(g.back_area);
+  const M8 front = verdict.facing < zero;
+  F8 area = Select8(front, front_area, back_area);
+  if (sees_inside) area = Max8(front_area, back_area);
+  // |facing| / d is the cosine; the sign of the result tells the side.
+  const F8 omega = -verdict.facing * area * inverse * inverse * inverse;
+  alignas(32) float w[5][8];
+  Store8(w[0], verdict.dx * inverse);
+  Store8(w[1], verdict.dy * inverse);
+  Store8(w[2], verdict.dz * inverse);
+  Store8(w[3], verdict.distance);
+  Store8(w[4], omega);
+  for (; mask != 0; mask &= mask - 1) {
+    const int k = std::countr_zero(mask);
+    // A node exactly at the view has no direction.
+    if (!(w[3][k] > 0.0f)) continue;
+    const uint32_t slot = slots != nullptr ? slots[k] : first_slot + static_cast<uint32_t>(k);
+    cut.push_back({slot, w[3][k], {w[0][k], w[1][k], w[2][k]}, w[4][k]});
+  }
+}
 
 // View and parameters, spread to eight lanes.
 struct LaneView {
@@ -41,7 +68,7 @@ struct LaneView {
         nx(Set8(view.normal.x)), ny(Set8(view.normal.y)), nz(Set8(view.normal.z)),
         radius(Set8(view.radius_m)), epsilon(Set8(params.epsilon)),
         sin_spread(Set8(view.sin_spread)), cos_spread(Set8(view.cos_spread)),
-        margin(Set8(view.margin_m)), size_limit(Set8(params.pixel_sr * kInvPif)), zero(Set8(0)),
+        margin(Set8(view.margin_m)), size_limit(Set8(params.pixel_sr * kCutPixels * kInvPif)), zero(Set8(0)),
         flat(view.sin_spread == 0.0f), everything_visible_above(view.sin_spread >= 1.0f),
         sees_inside(view.sees_inside), cosine_map(params.map == BufferMap::kCosine),
         sharing(want_near) {}
@@ -100,6 +127,10 @@ Verdict Judge(const NodeGroup& g, const LaneView& v, bool leaf, CutCounters& cou
 
   Verdict out;
   out.distance = d;
+  out.dx = dx;
+  out.dy = dy;
+  out.dz = dz;
+  out.facing = facing;
   // pi r² / d² against the pixel's solid angle.
   F8 limit = v.size_limit * d2;
   if (v.cosine_map) {
@@ -144,9 +175,9 @@ void Descend(const PointTree& tree, const LaneView& lanes, Pending first, std::v
     const Pending at = stack[--size];
     ++counters.groups_visited;
     const Verdict verdict = Judge(tree.group(at.group), lanes, at.level == 0, counters);
-    for (unsigned m = verdict.splat; m != 0; m &= m - 1) {
-      const int k = std::countr_zero(m);
-      far.push_back({at.group * kLanes + static_cast<uint32_t>(k), verdict.distance[k]});
+    if (verdict.splat != 0) {
+      Append(tree.group(at.group), verdict, verdict.splat, lanes.sees_inside, nullptr,
+             at.group * kLanes, far);
     }
     for (unsigned m = verdict.near; m != 0; m &= m - 1) {
       near->push_back({at.group * kLanes + static_cast<uint32_t>(std::countr_zero(m)), at.level});
@@ -220,9 +251,12 @@ void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutPar
     const bool leaf = near.nodes[gi * kLanes].level == 0;
     ++counters.groups_visited;
     const Verdict verdict = Judge(near.groups[gi], lanes, leaf, counters);
-    for (unsigned m = verdict.splat; m != 0; m &= m - 1) {
-      const int k = std::countr_zero(m);
-      cut.push_back({near.nodes[gi * kLanes + k].slot, verdict.distance[k]});
+    if (verdict.splat != 0) {
+      uint32_t slots[kLanes] = {};
+      for (uint32_t k = 0; k < kLanes && gi * kLanes + k < near.nodes.size(); ++k) {
+        slots[k] = near.nodes[gi * kLanes + k].slot;
+      }
+      Append(near.groups[gi], verdict, verdict.splat, lanes.sees_inside, slots, 0, cut);
     }
     for (unsigned m = verdict.descend; m != 0; m &= m - 1) {
       const NearNode& n = near.nodes[gi * kLanes + std::countr_zero(m)];

@@ -28,21 +28,26 @@ struct CutView {
   bool sees_inside = false;
 };
 
+inline constexpr float kCutPixels = 2.0f;
+
 // When to descend.
 struct CutParams {
   // far: R_c < epsilon (d - r); near: R_c >= epsilon (d + r) (§3.2 with its erratum, DESIGN §3:
   // the measure γ = R_c / d is small for far nodes), everything between descends.
   float epsilon = 0.1f;
-  // A node is fine enough if its sphere's solid angle pi r²/d² is at most that of one pixel in its
-  // direction. kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
+  // A node is fine enough if its sphere's solid angle pi r²/d² is at most that of kCutPixels
+  // pixels in its direction: a node is flat and seen at an angle, so what it covers is less. kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
   BufferMap map = BufferMap::kOctahedral;
   float pixel_sr = 0.01f;
 };
 
-// A node of a cut.
+// A node of a cut, with what drawing it needs: most nodes are drawn without a look into the tree.
 struct CutNode {
   uint32_t slot;      // group * 8 + lane
   float distance_m;   // from the view's position to the node's centre
+  Vec3f direction;    // unit, from the view to the node's centre, world
+  // Ω = A_visible |n·w| / d² [sr]; negative if the node shows its back.
+  float signed_solid_angle;
 };
 
 // A node where the traversal stopped because it is near some receiver of the cluster.

@@ -66,20 +66,22 @@ TEST_P(PointTreeSize, NodesBoundAndSumWhatIsBelowThem) {
         const float cosine = Dot(n, unit);
         const float height = leaf.radius[l] * std::sqrt(std::max(0.0f, 1 - cosine * cosine));
         EXPECT_LE(std::fabs(Dot(offset, unit)) + height, g.thickness[k] * 1.0001f + 1e-6f);
-        if (g.sin_cone[k] < 1) EXPECT_GE(cosine, cos_cone - 1e-4f);
+        if (g.sin_cone[k] < 1) {
+          EXPECT_GE(cosine, cos_cone - 1e-4f);
+        }
         area += leaf.area[l];
         front += leaf.front_area[l];
         normal += Vec3d(n) * static_cast<double>(leaf.area[l]);
         const RadianceGroup& r = tree->radiance(s / kLanes);
-        flux += Vec3d(r.front[0][l], r.front[1][l], r.front[2][l]) *
+        flux += Vec3d(r.lane[l].front) *
                 static_cast<double>(leaf.front_area[l]);
       });
       EXPECT_NEAR(g.area[k], area, area * 1e-5);
       EXPECT_NEAR(g.front_area[k], front, area * 1e-5);
       EXPECT_LT(Length(Vec3f(normal / area) - Normal(*tree, slot)), 1e-5f);
       const RadianceGroup& r = tree->radiance(slot / kLanes);
-      EXPECT_NEAR(r.front[0][k] * front, flux.x, 1e-5 * (1e-3 + flux.x));
-      EXPECT_NEAR(r.front[2][k] * front, flux.z, 1e-5 * (1e-3 + flux.z));
+      EXPECT_NEAR(r.lane[k].front.x * front, flux.x, 1e-5 * (1e-3 + flux.x));
+      EXPECT_NEAR(r.lane[k].front.z * front, flux.z, 1e-5 * (1e-3 + flux.z));
     }
   }
 }

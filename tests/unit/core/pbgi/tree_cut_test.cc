@@ -227,7 +227,7 @@ TEST(TreeCut, HiddenSidesAreCulledUnlessSeenFromInside) {
 TEST(TreeCut, SortIsFrontToBackAndStable) {
   std::vector<CutNode> cut, scratch;
   for (uint32_t i = 0; i < 5000; ++i) {
-    cut.push_back({i, ToUnitFloat(static_cast<uint32_t>(HashKey(8, i))) * 100.0f});
+    cut.push_back({i, ToUnitFloat(static_cast<uint32_t>(HashKey(8, i))) * 100.0f, {0, 0, 1}, 1});
   }
   const auto before = cut;
   SortFrontToBack(cut, scratch);
