@@ -29,7 +29,7 @@ struct WorkerOptions {
   size_t cached_scenes = 2;  // kept in memory, the one in use included; at least 1
   // Wait after a failed call: doubles from the first to the last, with jitter.
   std::chrono::milliseconds first_backoff{100};
-  std::chrono::milliseconds last_backoff{10000};
+  std::chrono::milliseconds last_backoff{2000};
   // How long Stop() lets the tile in work go on before it is given back.
   std::chrono::milliseconds drain_time{0};
   std::function<void(const WorkerLogEntry&)> log;  // may be empty; from any thread
