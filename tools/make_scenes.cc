@@ -1,8 +1,7 @@
 // farpoint-make-scenes: writes the project's own scenes as glTF (scenes/README.md).
+#include <CLI/CLI.hpp>
 #include <cstdio>
 #include <string>
-
-#include <CLI/CLI.hpp>
 
 #include "core/scene/procedural.h"
 
@@ -34,14 +33,17 @@ int main(int argc, char** argv) {
   CLI::App* cornell = add("cornell", "The Cornell box as measured");
   CLI::App* furnace = add("furnace", "A closed box that glows");
   float rho = 0.5f, radiance = 1;
-  furnace->add_option("--rho", rho, "Reflectance")->check(CLI::Range(0.0, 1.0))
+  furnace->add_option("--rho", rho, "Reflectance")
+      ->check(CLI::Range(0.0, 1.0))
       ->capture_default_str();
   furnace->add_option("--radiance", radiance, "Emitted radiance in W/(m² sr)")
-      ->check(CLI::Range(0.0, 1e9))->capture_default_str();
+      ->check(CLI::Range(0.0, 1e9))
+      ->capture_default_str();
   CLI::App* city = add("city", "A city of blocks x blocks");
   unsigned blocks = 8;
   uint64_t seed = 1;
-  city->add_option("--blocks", blocks, "Blocks on a side")->check(CLI::Range(1, 64))
+  city->add_option("--blocks", blocks, "Blocks on a side")
+      ->check(CLI::Range(1, 64))
       ->capture_default_str();
   city->add_option("--seed", seed, "Another seed, another city")->capture_default_str();
   try {

@@ -6,11 +6,10 @@
 #include <cstring>
 #include <initializer_list>
 #include <limits>
+#include <nlohmann/json.hpp>
 #include <optional>
 #include <set>
 #include <utility>
-
-#include <nlohmann/json.hpp>
 
 namespace farpoint {
 
@@ -27,15 +26,18 @@ constexpr uint64_t kMaxImplicitCount = uint64_t{1} << 24;
 // Levels of objects and arrays; tinygltf reads extras by recursion.
 constexpr int kMaxJsonDepth = 128;
 
-constexpr const char* kSupportedExtensions[] = {
-    "KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_texture_transform",
-    "KHR_mesh_quantization"};
+constexpr const char* kSupportedExtensions[] = {"KHR_lights_punctual",
+                                                "KHR_materials_emissive_strength",
+                                                "KHR_texture_transform", "KHR_mesh_quantization"};
 
 // What tinygltf decodes.
-constexpr const char* kDataUriHeads[] = {
-    "data:application/octet-stream;base64,", "data:application/gltf-buffer;base64,",
-    "data:text/plain;base64,", "data:image/jpeg;base64,", "data:image/png;base64,",
-    "data:image/bmp;base64,", "data:image/gif;base64,"};
+constexpr const char* kDataUriHeads[] = {"data:application/octet-stream;base64,",
+                                         "data:application/gltf-buffer;base64,",
+                                         "data:text/plain;base64,",
+                                         "data:image/jpeg;base64,",
+                                         "data:image/png;base64,",
+                                         "data:image/bmp;base64,",
+                                         "data:image/gif;base64,"};
 
 // A JSON value and where it stands. The path is put together only for a message.
 class Place {
@@ -105,7 +107,8 @@ absl::Status RequireUnsigned(const Place& parent, const char* key, uint64_t max,
 
 // An index into an array of `size` elements.
 absl::Status CheckIndexValue(const Place& place, size_t size, const char* what) {
-  if (!place.value().is_number_integer()) return WrongType(place, "an index into " + std::string(what));
+  if (!place.value().is_number_integer())
+    return WrongType(place, "an index into " + std::string(what));
   const bool negative = !place.value().is_number_unsigned() && place.value().get<int64_t>() < 0;
   if (negative || place.value().get<uint64_t>() >= size) {
     return place.Fail("index " + place.value().dump() + " is beyond the " + std::to_string(size) +
@@ -218,8 +221,10 @@ absl::Status CheckDepth(const std::string& name, std::string_view text) {
   for (size_t i = 0; i < text.size(); ++i) {
     const char c = text[i];
     if (in_string) {
-      if (c == '\\') ++i;
-      else if (c == '"') in_string = false;
+      if (c == '\\')
+        ++i;
+      else if (c == '"')
+        in_string = false;
     } else if (c == '"') {
       in_string = true;
     } else if (c == '{' || c == '[') {
@@ -276,8 +281,10 @@ absl::Status CheckRelative(const Place& place, const std::string& decoded) {
   while (begin <= decoded.size()) {
     const size_t end = std::min(decoded.find_first_of("/\\", begin), decoded.size());
     const std::string_view part = std::string_view(decoded).substr(begin, end - begin);
-    if (part == "..") --level;
-    else if (!part.empty() && part != ".") ++level;
+    if (part == "..")
+      --level;
+    else if (!part.empty() && part != ".")
+      ++level;
     if (level < 0) {
       return place.Fail("'" + decoded + "' leaves the scene's folder; put the file into it");
     }
@@ -292,7 +299,8 @@ absl::StatusOr<std::string> ReadExternalUri(const Place& place) {
   const std::string& uri = place.value().get_ref<const std::string&>();
   if (IsDataUri(uri)) return std::string();
   if (const auto scheme = SchemeOf(uri)) {
-    return place.Fail("URIs of scheme '" + *scheme + ":' are not followed; download the file and "
+    return place.Fail("URIs of scheme '" + *scheme +
+                      ":' are not followed; download the file and "
                       "put it beside the scene");
   }
   std::string decoded = DecodeUri(uri);
@@ -328,10 +336,17 @@ absl::StatusOr<uint64_t> DataUriSize(const Place& place) {
 
 uint64_t ComponentSize(uint64_t component_type) {
   switch (component_type) {
-    case 5120: case 5121: return 1;
-    case 5122: case 5123: return 2;
-    case 5125: case 5126: return 4;
-    default: return 0;
+    case 5120:
+    case 5121:
+      return 1;
+    case 5122:
+    case 5123:
+      return 2;
+    case 5125:
+    case 5126:
+      return 4;
+    default:
+      return 0;
   }
 }
 
@@ -363,34 +378,26 @@ class Checker {
     FP_RETURN_IF_ERROR(CheckExtensions());
     FP_RETURN_IF_ERROR(CheckBuffers());
     FP_RETURN_IF_ERROR(CheckBufferViews());
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "accessors", [&](const Place& p) {
-      return CheckAccessor(p);
-    }));
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "images", [&](const Place& p) {
-      return CheckImage(p);
-    }));
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "samplers", [&](const Place& p) {
-      return CheckSampler(p);
-    }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "accessors", [&](const Place& p) { return CheckAccessor(p); }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "images", [&](const Place& p) { return CheckImage(p); }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "samplers", [&](const Place& p) { return CheckSampler(p); }));
     FP_RETURN_IF_ERROR(ForEachObject(root_, "textures", [&](const Place& p) -> absl::Status {
       std::optional<size_t> index;
       FP_RETURN_IF_ERROR(ReadIndex(p, "source", Size("images"), "images", index));
       FP_RETURN_IF_ERROR(ReadIndex(p, "sampler", Size("samplers"), "samplers", index));
       return CheckString(p, "name");
     }));
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "materials", [&](const Place& p) {
-      return CheckMaterial(p);
-    }));
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "meshes", [&](const Place& p) {
-      return CheckMesh(p);
-    }));
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "cameras", [&](const Place& p) {
-      return CheckCamera(p);
-    }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "materials", [&](const Place& p) { return CheckMaterial(p); }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "meshes", [&](const Place& p) { return CheckMesh(p); }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "cameras", [&](const Place& p) { return CheckCamera(p); }));
     FP_RETURN_IF_ERROR(CheckLights());
-    FP_RETURN_IF_ERROR(ForEachObject(root_, "nodes", [&](const Place& p) {
-      return CheckNode(p);
-    }));
+    FP_RETURN_IF_ERROR(ForEachObject(root_, "nodes", [&](const Place& p) { return CheckNode(p); }));
     FP_RETURN_IF_ERROR(ForEachObject(root_, "scenes", [&](const Place& p) -> absl::Status {
       FP_RETURN_IF_ERROR(CheckString(p, "name"));
       FP_RETURN_IF_ERROR(CheckSky(p));
@@ -419,8 +426,8 @@ class Checker {
     }
     const Json* min_version = place.Find("minVersion");
     if (min_version != nullptr && min_version->get<std::string>() != "2.0") {
-      return place.Member("minVersion").Fail("is '" + min_version->get<std::string>() +
-                                             "'; only glTF 2.0 is read");
+      return place.Member("minVersion")
+          .Fail("is '" + min_version->get<std::string>() + "'; only glTF 2.0 is read");
     }
     return absl::OkStatus();
   }
@@ -487,8 +494,8 @@ class Checker {
         }
       }
       if (available < length) {
-        return place.Fail(source + " has " + std::to_string(available) +
-                          " bytes, fewer than the " + std::to_string(length) + " of byteLength");
+        return place.Fail(source + " has " + std::to_string(available) + " bytes, fewer than the " +
+                          std::to_string(length) + " of byteLength");
       }
       if (length == 0) return place.Member("byteLength").Fail("is 0");
       buffer_sizes_.push_back(length);
@@ -517,8 +524,8 @@ class Checker {
                           std::to_string(size) + " bytes of buffer " + std::to_string(*buffer));
       }
       if (stride && (*stride < 4 || *stride % 4 != 0)) {
-        return place.Member("byteStride").Fail("is " + std::to_string(*stride) +
-                                               " instead of a multiple of 4 in [4, 252]");
+        return place.Member("byteStride")
+            .Fail("is " + std::to_string(*stride) + " instead of a multiple of 4 in [4, 252]");
       }
       views_.push_back({length, stride.value_or(0)});
       return absl::OkStatus();
@@ -662,25 +669,25 @@ class Checker {
       return WithObject(info, "extensions", [&](const Place& extensions) {
         return WithObject(extensions, "KHR_texture_transform",
                           [&](const Place& transform) -> absl::Status {
-          FP_RETURN_IF_ERROR(CheckNumbers(transform, "offset", 2, -1e9, 1e9));
-          FP_RETURN_IF_ERROR(CheckNumbers(transform, "scale", 2, -1e9, 1e9));
-          FP_RETURN_IF_ERROR(CheckNumber(transform, "rotation", -1e6, 1e6));
-          return ReadUnsigned(transform, "texCoord", kMaxInt, uv_set);
-        });
+                            FP_RETURN_IF_ERROR(CheckNumbers(transform, "offset", 2, -1e9, 1e9));
+                            FP_RETURN_IF_ERROR(CheckNumbers(transform, "scale", 2, -1e9, 1e9));
+                            FP_RETURN_IF_ERROR(CheckNumber(transform, "rotation", -1e6, 1e6));
+                            return ReadUnsigned(transform, "texCoord", kMaxInt, uv_set);
+                          });
       });
     });
   }
 
   absl::Status CheckMaterial(const Place& place) {
     FP_RETURN_IF_ERROR(CheckString(place, "name"));
-    FP_RETURN_IF_ERROR(WithObject(place, "pbrMetallicRoughness",
-                                  [&](const Place& pbr) -> absl::Status {
-      FP_RETURN_IF_ERROR(CheckNumbers(pbr, "baseColorFactor", 4, 0, 1e6));
-      FP_RETURN_IF_ERROR(CheckNumber(pbr, "metallicFactor", 0, 1));
-      FP_RETURN_IF_ERROR(CheckNumber(pbr, "roughnessFactor", 0, 1));
-      FP_RETURN_IF_ERROR(CheckTextureInfo(pbr, "metallicRoughnessTexture"));
-      return CheckTextureInfo(pbr, "baseColorTexture");
-    }));
+    FP_RETURN_IF_ERROR(
+        WithObject(place, "pbrMetallicRoughness", [&](const Place& pbr) -> absl::Status {
+          FP_RETURN_IF_ERROR(CheckNumbers(pbr, "baseColorFactor", 4, 0, 1e6));
+          FP_RETURN_IF_ERROR(CheckNumber(pbr, "metallicFactor", 0, 1));
+          FP_RETURN_IF_ERROR(CheckNumber(pbr, "roughnessFactor", 0, 1));
+          FP_RETURN_IF_ERROR(CheckTextureInfo(pbr, "metallicRoughnessTexture"));
+          return CheckTextureInfo(pbr, "baseColorTexture");
+        }));
     FP_RETURN_IF_ERROR(CheckNumbers(place, "emissiveFactor", 3, 0, 1e12));
     FP_RETURN_IF_ERROR(CheckTextureInfo(place, "emissiveTexture"));
     FP_RETURN_IF_ERROR(CheckTextureInfo(place, "normalTexture"));
@@ -719,12 +726,12 @@ class Checker {
         if (accessor["type"] != "SCALAR" || (type != 5121 && type != 5123 && type != 5125)) {
           return indices.Fail(accessor_name + " is not SCALAR of componentType 5121, 5123 or 5125");
         }
-        if (!accessor.contains("bufferView")) return indices.Fail(accessor_name + " has no bufferView");
+        if (!accessor.contains("bufferView"))
+          return indices.Fail(accessor_name + " has no bufferView");
       }
       if (primitive.Find("attributes") == nullptr) return primitive.Fail("has no 'attributes'");
-      return WithObject(primitive, "attributes", [&](const Place& attributes) {
-        return CheckAttributes(attributes);
-      });
+      return WithObject(primitive, "attributes",
+                        [&](const Place& attributes) { return CheckAttributes(attributes); });
     });
   }
 

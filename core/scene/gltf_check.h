@@ -17,7 +17,7 @@ namespace farpoint {
 
 // Views into the main file.
 struct GltfContainer {
-  bool binary = false;             // .glb
+  bool binary = false;  // .glb
   std::string_view json;
   std::span<const std::byte> bin;  // the BIN chunk of a .glb, else empty
 };

@@ -1,5 +1,7 @@
 #include "core/scene/gltf_importer.h"
 
+#include <tiny_gltf.h>
+
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -7,8 +9,6 @@
 #include <map>
 #include <set>
 #include <utility>
-
-#include <tiny_gltf.h>
 
 #include "core/math/elementary.h"
 #include "core/scene/gltf_check.h"
@@ -21,10 +21,16 @@ namespace {
 constexpr double kLumensPerWatt = 683.0;
 
 // Extensions that only concern what a Lambert surface does not show, or nothing that is rendered.
-const char* const kHarmlessExtensions[] = {
-    "KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_texture_transform",
-    "KHR_mesh_quantization", "KHR_materials_ior", "KHR_materials_specular",
-    "KHR_materials_anisotropy", "KHR_xmp_json_ld", "KHR_xmp", "FB_ngon_encoding"};
+const char* const kHarmlessExtensions[] = {"KHR_lights_punctual",
+                                           "KHR_materials_emissive_strength",
+                                           "KHR_texture_transform",
+                                           "KHR_mesh_quantization",
+                                           "KHR_materials_ior",
+                                           "KHR_materials_specular",
+                                           "KHR_materials_anisotropy",
+                                           "KHR_xmp_json_ld",
+                                           "KHR_xmp",
+                                           "FB_ngon_encoding"};
 
 std::string Indexed(const char* array, size_t index) {
   return std::string("/") + array + "/" + std::to_string(index);
@@ -110,8 +116,10 @@ double ReadComponent(const unsigned char* at, int type, bool normalized) {
       const double v = load(uint16_t{});
       return normalized ? v / 65535.0 : v;
     }
-    case TINYGLTF_COMPONENT_TYPE_UNSIGNED_INT: return load(uint32_t{});
-    default: return static_cast<double>(load(float{}));
+    case TINYGLTF_COMPONENT_TYPE_UNSIGNED_INT:
+      return load(uint32_t{});
+    default:
+      return static_cast<double>(load(float{}));
   }
 }
 
@@ -120,8 +128,8 @@ class AccessorReader {
  public:
   AccessorReader(const tinygltf::Model& model, int index)
       : accessor_(model.accessors[static_cast<size_t>(index)]),
-        component_size_(tinygltf::GetComponentSizeInBytes(
-            static_cast<uint32_t>(accessor_.componentType))),
+        component_size_(
+            tinygltf::GetComponentSizeInBytes(static_cast<uint32_t>(accessor_.componentType))),
         components_(tinygltf::GetNumComponentsInType(static_cast<uint32_t>(accessor_.type))) {
     const int element_size = component_size_ * components_;
     if (accessor_.bufferView >= 0) {
@@ -310,15 +318,16 @@ class Importer {
       FP_ASSIGN_OR_RETURN(const Blob blob, asset_.Find(DecodeUri(buffer.uri)));
       const auto bytes = blob.bytes().subspan(0, buffer.byte_length);
       const std::string name = TinygltfName(buffer.uri);
-      const auto [it, is_new] = files.by_name.try_emplace(name, BufferFiles::File{bytes, buffer.uri});
+      const auto [it, is_new] =
+          files.by_name.try_emplace(name, BufferFiles::File{bytes, buffer.uri});
       if (is_new) continue;
       if (it->second.uri != buffer.uri) {
         return Fail("/buffers", "'" + it->second.uri + "' and '" + buffer.uri +
                                     "' differ only by a plus sign for a blank; rename one");
       }
       if (it->second.bytes.size() != bytes.size()) {
-        return Fail("/buffers", "two buffers give '" + buffer.uri +
-                                    "' different lengths; make them one");
+        return Fail("/buffers",
+                    "two buffers give '" + buffer.uri + "' different lengths; make them one");
       }
     }
     return absl::OkStatus();
@@ -350,8 +359,8 @@ class Importer {
       if (used.count(static_cast<int>(t)) != 0 && source.source >= 0) {
         const auto i = static_cast<size_t>(source.source);
         auto& image = model_.images[i];
-        texture.name = image.uri.empty() || IsDataUri(image.uri)
-                           ? NameOr(image.name, "image", i) : DecodeUri(image.uri);
+        texture.name = image.uri.empty() || IsDataUri(image.uri) ? NameOr(image.name, "image", i)
+                                                                 : DecodeUri(image.uri);
         if (images[i].size() == 0) {
           if (!image.image.empty()) {
             const auto bytes = std::as_bytes(std::span(image.image));
@@ -359,7 +368,8 @@ class Importer {
             image.image.clear();
           } else {
             auto file = asset_.Find(DecodeUri(image.uri));
-            if (!file.ok()) return Annotate(file.status(), asset_.root + ": " + Indexed("images", i));
+            if (!file.ok())
+              return Annotate(file.status(), asset_.root + ": " + Indexed("images", i));
             images[i] = *std::move(file);
           }
         }
@@ -442,7 +452,8 @@ class Importer {
               static_cast<float>(source.emissiveFactor[static_cast<size_t>(c)] * strength);
         }
       }
-      material.emission_texture = ImportTextureRef(source.emissiveTexture, place + "/emissiveTexture");
+      material.emission_texture =
+          ImportTextureRef(source.emissiveTexture, place + "/emissiveTexture");
       scene_.materials.push_back(std::move(material));
     }
     if (blended > 0) {
@@ -477,7 +488,8 @@ class Importer {
     if (!primitive.targets.empty()) ++morphed_;
     const AccessorReader positions(model_, position->second);
     if (!positions.SparseIndicesAreValid()) {
-      return Fail(place + "/attributes/POSITION", "the indices of its sparse accessor do not "
+      return Fail(place + "/attributes/POSITION",
+                  "the indices of its sparse accessor do not "
                   "ascend inside of the accessor; correct the file or export it again");
     }
     Mesh mesh;
@@ -496,8 +508,9 @@ class Importer {
     for (const uint32_t v : used) {
       const Vec3f p = positions.Get3(v);
       if (!farpoint::IsFinite(p)) {
-        return Fail(place + "/attributes/POSITION", "position " + std::to_string(v) +
-                    " is not finite; correct the file or export it again");
+        return Fail(place + "/attributes/POSITION",
+                    "position " + std::to_string(v) +
+                        " is not finite; correct the file or export it again");
       }
       mesh.positions.push_back(p);
     }
@@ -528,7 +541,8 @@ class Importer {
     if (it == primitive.attributes.end()) return absl::OkStatus();
     const AccessorReader reader(model_, it->second);
     if (!reader.SparseIndicesAreValid()) {
-      return Fail(place + "/attributes/" + name, "the indices of its sparse accessor do not "
+      return Fail(place + "/attributes/" + name,
+                  "the indices of its sparse accessor do not "
                   "ascend inside of the accessor; correct the file or export it again");
     }
     body(reader);
@@ -556,15 +570,17 @@ class Importer {
     }
     const AccessorReader reader(model_, primitive.indices);
     if (!reader.SparseIndicesAreValid()) {
-      return Fail(place + "/indices", "the indices of its sparse accessor do not ascend inside of "
+      return Fail(place + "/indices",
+                  "the indices of its sparse accessor do not ascend inside of "
                   "the accessor; correct the file or export it again");
     }
     for (size_t i = 0; i < count; ++i) {
       corners[i] = static_cast<uint32_t>(reader.Get(i, 0));
       if (corners[i] >= vertex_count) {
         return Fail(place + "/indices", "index " + std::to_string(corners[i]) + " is beyond the " +
-                    std::to_string(vertex_count) + " positions; correct the file or export it "
-                    "again");
+                                            std::to_string(vertex_count) +
+                                            " positions; correct the file or export it "
+                                            "again");
       }
     }
     return absl::OkStatus();
@@ -575,8 +591,9 @@ class Importer {
     const size_t count = corners.size();
     if (mode == TINYGLTF_MODE_TRIANGLES) {
       if (count % 3 != 0) {
-        return Fail(place, "has " + std::to_string(count) + " indices, which is no multiple of 3; "
-                    "correct the file or export it again");
+        return Fail(place, "has " + std::to_string(count) +
+                               " indices, which is no multiple of 3; "
+                               "correct the file or export it again");
       }
       mesh.triangles.reserve(count / 3);
       for (size_t i = 0; i + 2 < count; i += 3) {
@@ -679,10 +696,10 @@ class Importer {
       const std::string place = Indexed("nodes", n);
       if (visited[n]) {
         return Fail(place, "is reached twice" +
-                    (visit.parent < 0 ? std::string(" as a root of the scene")
-                                      : ", the second time from node " +
-                                            std::to_string(visit.parent)) +
-                    "; nodes must form a tree: correct the file or export it again");
+                               (visit.parent < 0 ? std::string(" as a root of the scene")
+                                                 : ", the second time from node " +
+                                                       std::to_string(visit.parent)) +
+                               "; nodes must form a tree: correct the file or export it again");
       }
       visited[n] = true;
       const auto& node = model_.nodes[n];
@@ -698,8 +715,9 @@ class Importer {
     const size_t unreached = static_cast<size_t>(std::count(visited.begin(), visited.end(), false));
     // A cycle without a root is not reached at all.
     if (model_.scenes.empty() && unreached > 0) {
-      return Fail("/nodes", Counted(unreached, "node") +
-                  " form cycles; nodes must form a tree: correct the file or export it again");
+      return Fail("/nodes",
+                  Counted(unreached, "node") +
+                      " form cycles; nodes must form a tree: correct the file or export it again");
     }
     return absl::OkStatus();
   }
@@ -754,7 +772,7 @@ class Importer {
     const auto& source = model_.lights[index];
     PunctualLight light;
     light.name = node_name;
-    light.kind = source.type == "point" ? PunctualKind::kPoint
+    light.kind = source.type == "point"  ? PunctualKind::kPoint
                  : source.type == "spot" ? PunctualKind::kSpot
                                          : PunctualKind::kDirectional;
     const double unit = options_.light_units == LightUnits::kPhotometric ? 1 / kLumensPerWatt : 1;
@@ -796,9 +814,9 @@ class Importer {
   }
 
   absl::Status TooManyTriangles(const std::string& place) const {
-    return absl::ResourceExhaustedError(
-        asset_.root + ": " + place + ": the scene has more than " +
-        std::to_string(options_.max_triangles) + " triangles; simplify it or raise the limit");
+    return absl::ResourceExhaustedError(asset_.root + ": " + place + ": the scene has more than " +
+                                        std::to_string(options_.max_triangles) +
+                                        " triangles; simplify it or raise the limit");
   }
 
   absl::Status CheckTriangleCount() {
@@ -814,7 +832,8 @@ class Importer {
     if (skipped_lines_ > 0) {
       Note(Counted(skipped_lines_, "primitive") + " of points or lines skipped");
     }
-    if (skipped_empty_ > 0) Note(Counted(skipped_empty_, "primitive") + " without triangles skipped");
+    if (skipped_empty_ > 0)
+      Note(Counted(skipped_empty_, "primitive") + " without triangles skipped");
     if (morphed_ > 0) {
       Note(Counted(morphed_, "primitive") + " with morph targets: shown without them");
     }

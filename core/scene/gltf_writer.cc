@@ -4,10 +4,9 @@
 #include <cstring>
 #include <filesystem>
 #include <map>
+#include <nlohmann/json.hpp>
 #include <utility>
 #include <vector>
-
-#include <nlohmann/json.hpp>
 
 #include "core/base/hash.h"
 #include "core/scene/procedural.h"
@@ -79,7 +78,9 @@ class Writer {
     return root_[array].size() - 1;
   }
 
-  void AddNode(Json node) { root_["scenes"][0]["nodes"].push_back(Append("nodes", std::move(node))); }
+  void AddNode(Json node) {
+    root_["scenes"][0]["nodes"].push_back(Append("nodes", std::move(node)));
+  }
 
   static void PlaceNode(const Affine& m, Json& node) {
     Affine at_origin = m;
@@ -106,7 +107,9 @@ class Writer {
   Json Accessor(const std::vector<T>& values, size_t count, int component_type, const char* type,
                 int target) {
     return {{"bufferView", View(std::as_bytes(std::span(values)), target)},
-            {"componentType", component_type}, {"count", count}, {"type", type}};
+            {"componentType", component_type},
+            {"count", count},
+            {"type", type}};
   }
 
   // Equal accessors are written once.
@@ -162,7 +165,9 @@ class Writer {
                                        {"mimeType", png ? "image/png" : "image/jpeg"}});
       }
       const auto wrap = [](WrapMode mode) {
-        return mode == WrapMode::kRepeat ? 10497 : mode == WrapMode::kMirroredRepeat ? 33648 : 33071;
+        return mode == WrapMode::kRepeat           ? 10497
+               : mode == WrapMode::kMirroredRepeat ? 33648
+                                                   : 33071;
       };
       const size_t sampler = Append("samplers", {{"magFilter", texture.nearest ? 9728 : 9729},
                                                  {"wrapS", wrap(texture.wrap_s)},
@@ -217,10 +222,10 @@ class Writer {
   }
 
   void WriteCamera(const Camera& camera) {
-    const size_t index = Append(
-        "cameras", {{"name", camera.name},
-                    {"type", "perspective"},
-                    {"perspective", {{"yfov", camera.yfov_rad}, {"znear", 0.01}}}});
+    const size_t index =
+        Append("cameras", {{"name", camera.name},
+                           {"type", "perspective"},
+                           {"perspective", {{"yfov", camera.yfov_rad}, {"znear", 0.01}}}});
     Affine world_from_camera;
     world_from_camera.column[0] = camera.right;
     world_from_camera.column[1] = camera.up;
@@ -234,7 +239,7 @@ class Writer {
   void WriteLight(const PunctualLight& light) {
     Use("KHR_lights_punctual");
     const double intensity = MaxComponent(light.intensity);
-    const char* type = light.kind == PunctualKind::kPoint ? "point"
+    const char* type = light.kind == PunctualKind::kPoint  ? "point"
                        : light.kind == PunctualKind::kSpot ? "spot"
                                                            : "directional";
     Json object = {{"name", light.name}, {"type", type}, {"intensity", intensity * kLumensPerWatt}};
@@ -328,7 +333,8 @@ absl::Status WriteGltf(const Scene& scene, const std::string& path) {
   const std::string text = document.dump(-1, ' ', false, Json::error_handler_t::replace);
   constexpr uint64_t kMaxGlb = 0xffffffff;
   if (text.size() + bin.size() + 64 > kMaxGlb) {
-    return absl::ResourceExhaustedError("'" + path + "' would have more than the 4 GiB of a .glb; "
+    return absl::ResourceExhaustedError("'" + path +
+                                        "' would have more than the 4 GiB of a .glb; "
                                         "write a .gltf");
   }
   std::vector<std::byte> glb(12);

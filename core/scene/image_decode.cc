@@ -39,36 +39,47 @@ namespace {
 constexpr uint64_t kMaxTexels = uint64_t{1} << 27;
 constexpr size_t kHeaderBlockLimit = size_t{1} << 20;
 
+absl::Status Fail(const std::string& name, const std::string& text) {
+  return absl::InvalidArgumentError("image '" + name + "': " + text);
+}
+
+const stbi_uc* DataOf(std::span<const std::byte> bytes) {
+  return reinterpret_cast<const stbi_uc*>(bytes.data());
+}
+
 }  // namespace
 
-absl::StatusOr<DecodedImage> DecodeImage(const std::string& name,
-                                         std::span<const std::byte> bytes) {
-  const auto fail = [&](const std::string& text) {
-    return absl::InvalidArgumentError("image '" + name + "': " + text);
-  };
-  if (bytes.empty()) return fail("is empty; export it again");
-  if (bytes.size() > (size_t{1} << 30)) return fail("has more than 1 GiB; make it smaller");
-  const auto* data = reinterpret_cast<const stbi_uc*>(bytes.data());
-  const int size = static_cast<int>(bytes.size());
+absl::StatusOr<ImageSize> ReadImageSize(const std::string& name, std::span<const std::byte> bytes) {
+  if (bytes.empty()) return Fail(name, "is empty; export it again");
+  if (bytes.size() > (size_t{1} << 30)) return Fail(name, "has more than 1 GiB; make it smaller");
   int width = 0, height = 0, channels = 0;
   block_limit = kHeaderBlockLimit;
-  if (stbi_info_from_memory(data, size, &width, &height, &channels) == 0) {
-    return fail(std::string("cannot be read (") + stbi_failure_reason() +
-                "); PNG and JPEG are supported");
+  if (stbi_info_from_memory(DataOf(bytes), static_cast<int>(bytes.size()), &width, &height,
+                            &channels) == 0) {
+    return Fail(name, std::string("cannot be read (") + stbi_failure_reason() +
+                          "); PNG and JPEG are supported");
   }
   if (width < 1 || height < 1 || width > static_cast<int>(kMaxImageSide) ||
       height > static_cast<int>(kMaxImageSide) ||
       static_cast<uint64_t>(width) * static_cast<uint64_t>(height) > kMaxTexels) {
-    return fail("is " + std::to_string(width) + " x " + std::to_string(height) +
-                " texels; at most " + std::to_string(kMaxImageSide) + " on a side and 2^27 in all "
-                "are read: make it smaller");
+    return Fail(name, "is " + std::to_string(width) + " x " + std::to_string(height) +
+                          " texels; at most " + std::to_string(kMaxImageSide) +
+                          " on a side and 2^27 in all are read: make it smaller");
   }
+  return ImageSize{static_cast<uint32_t>(width), static_cast<uint32_t>(height)};
+}
+
+absl::StatusOr<DecodedImage> DecodeImage(const std::string& name,
+                                         std::span<const std::byte> bytes) {
+  FP_ASSIGN_OR_RETURN(const ImageSize size, ReadImageSize(name, bytes));
   // Four channels of 16 bits, blocks padded to 64 texels, and a factor of two for growing buffers.
-  block_limit = kHeaderBlockLimit + 16 * (static_cast<size_t>(width) + 64) *
-                                        (static_cast<size_t>(height) + 64);
-  stbi_uc* decoded = stbi_load_from_memory(data, size, &width, &height, &channels, 4);
+  block_limit = kHeaderBlockLimit + 16 * (size_t{size.width} + 64) * (size_t{size.height} + 64);
+  int width = 0, height = 0, channels = 0;
+  stbi_uc* decoded = stbi_load_from_memory(DataOf(bytes), static_cast<int>(bytes.size()), &width,
+                                           &height, &channels, 4);
   if (decoded == nullptr) {
-    return fail(std::string("cannot be decoded (") + stbi_failure_reason() + "); export it again");
+    return Fail(name,
+                std::string("cannot be decoded (") + stbi_failure_reason() + "); export it again");
   }
   DecodedImage image;
   image.width = static_cast<uint32_t>(width);

@@ -56,7 +56,8 @@ Camera FramingCamera(const Box3d& bounds) {
 absl::StatusOr<ImportedScene> ImportScene(const AssetBundle& asset, const ImportOptions& options) {
   FP_ASSIGN_OR_RETURN(const SceneFormat format, SceneFormatOf(asset.root));
   switch (format) {
-    case SceneFormat::kGltf: return ImportGltf(asset, options);
+    case SceneFormat::kGltf:
+      return ImportGltf(asset, options);
   }
   return absl::InternalError("unknown scene format");
 }
@@ -65,8 +66,9 @@ void EnsureCameraAndLight(ImportedScene& imported) {
   Scene& scene = imported.scene;
   if (scene.cameras.empty()) {
     scene.cameras.push_back(FramingCamera(WorldBounds(scene)));
-    imported.notes.push_back("no camera: one was placed that frames the whole scene; choose your "
-                             "own with --eye, --target and --fov");
+    imported.notes.push_back(
+        "no camera: one was placed that frames the whole scene; choose your "
+        "own with --eye, --target and --fov");
   }
   if (!IsLit(scene)) {
     PunctualLight sun;
@@ -76,8 +78,9 @@ void EnsureCameraAndLight(ImportedScene& imported) {
     sun.intensity = {2.8f, 2.6f, 2.3f};
     scene.lights.push_back(sun);
     scene.environment.sky = {0.28f, 0.34f, 0.45f};
-    imported.notes.push_back("no light: a sun and a sky were added; choose your own with --sun "
-                             "and --sky");
+    imported.notes.push_back(
+        "no light: a sun and a sky were added; choose your own with --sun "
+        "and --sky");
   }
 }
 

@@ -30,7 +30,7 @@ constexpr double kMinAreaRatio = 0x1p-60;
 constexpr double kMinSliverRatio = 0x1p-44;
 constexpr float kMaxRadiance = 1e15f;
 constexpr float kMaxUvFactor = 1e10f;
-constexpr uint64_t kMaxTexels = uint64_t{1} << 31;
+constexpr uint64_t kMaxTexels = uint64_t{1} << 30;
 constexpr uint64_t kMaxElements = std::numeric_limits<uint32_t>::max();
 constexpr size_t kPiece = 1 << 14;
 
@@ -63,9 +63,12 @@ struct Tap {
 float Wrap(float u, WrapMode mode) {
   if (!(std::fabs(u) < 1e9f)) return 0.0f;
   switch (mode) {
-    case WrapMode::kRepeat: return u - std::floor(u);
-    case WrapMode::kMirroredRepeat: return u - 2.0f * std::floor(0.5f * u);
-    default: return std::clamp(u, 0.0f, 1.0f);
+    case WrapMode::kRepeat:
+      return u - std::floor(u);
+    case WrapMode::kMirroredRepeat:
+      return u - 2.0f * std::floor(0.5f * u);
+    default:
+      return std::clamp(u, 0.0f, 1.0f);
   }
 }
 
@@ -78,7 +81,8 @@ uint32_t WrapTexel(int32_t i, int32_t size, WrapMode mode) {
     case WrapMode::kMirroredRepeat:
       if (i < 0 || i >= 2 * size) return 0;
       return static_cast<uint32_t>(i >= size ? 2 * size - 1 - i : i);
-    default: return static_cast<uint32_t>(std::clamp(i, 0, size - 1));
+    default:
+      return static_cast<uint32_t>(std::clamp(i, 0, size - 1));
   }
 }
 
@@ -106,8 +110,8 @@ Vec3d CrossOf(const Vec3f& a, const Vec3f& b, const Vec3f& c) {
 }
 
 bool IsDegenerate(const Vec3f& a, const Vec3f& b, const Vec3f& c, double min_area) {
-  const double edge2 = std::max({Length2(Vec3d(b) - Vec3d(a)), Length2(Vec3d(c) - Vec3d(a)),
-                                 Length2(Vec3d(c) - Vec3d(b))});
+  const double edge2 = std::max(
+      {Length2(Vec3d(b) - Vec3d(a)), Length2(Vec3d(c) - Vec3d(a)), Length2(Vec3d(c) - Vec3d(b))});
   const double double_area = Length(CrossOf(a, b, c));
   return !(double_area > kMinSliverRatio * edge2) || !(0.5 * double_area > min_area);
 }
@@ -241,10 +245,9 @@ class Builder {
     }
     for (size_t i = 0; i < scene_.instances.size(); ++i) {
       if (scene_.instances[i].mesh >= scene_.meshes.size()) {
-        return absl::InvalidArgumentError("instance " + std::to_string(i) + " ('" +
-                                          scene_.instances[i].name + "'): mesh " +
-                                          std::to_string(scene_.instances[i].mesh) +
-                                          " does not exist");
+        return absl::InvalidArgumentError(
+            "instance " + std::to_string(i) + " ('" + scene_.instances[i].name + "'): mesh " +
+            std::to_string(scene_.instances[i].mesh) + " does not exist");
       }
     }
     return absl::OkStatus();
@@ -300,8 +303,10 @@ class Builder {
     for (const Instance& instance : scene_.instances) {
       const Mesh& mesh = MeshOf(instance);
       if (mesh.triangles.empty()) continue;
-      if (mesh.material < 0) uses_default = true;
-      else used[static_cast<size_t>(mesh.material)] = true;
+      if (mesh.material < 0)
+        uses_default = true;
+      else
+        used[static_cast<size_t>(mesh.material)] = true;
     }
     prepared_material_.assign(scene_.materials.size(), 0);
     prepared_texture_.assign(scene_.textures.size(), -1);
@@ -375,8 +380,8 @@ class Builder {
       return fail("texture " + std::to_string(ref.texture) + " does not exist; there are " +
                   std::to_string(scene_.textures.size()));
     }
-    if (ref.uv_set > 1) return fail("texture coordinate set " + std::to_string(ref.uv_set) +
-                                    "; only 0 and 1 exist");
+    if (ref.uv_set > 1)
+      return fail("texture coordinate set " + std::to_string(ref.uv_set) + "; only 0 and 1 exist");
     MakeUvMatrix(ref.transform, uv_matrix);
     for (const float f : uv_matrix) {
       if (!(std::fabs(f) <= kMaxUvFactor)) return fail("texture transform beyond 1e10; correct it");
@@ -399,27 +404,30 @@ class Builder {
     std::vector<const Texture*> images;
     for (const size_t t : source_textures_) {
       const Texture& source = scene_.textures[t];
-      const auto [it, is_new] = image_of_bytes.try_emplace(source.encoded.bytes().data(), images.size());
+      const auto [it, is_new] =
+          image_of_bytes.try_emplace(source.encoded.bytes().data(), images.size());
       if (is_new) images.push_back(&source);
       image_of_texture.push_back(it->second);
+    }
+    // Small files can hold large images: all sizes are added up before anything is decoded.
+    std::vector<uint64_t> first_texel;
+    uint64_t total = 0;
+    for (const Texture* image : images) {
+      FP_ASSIGN_OR_RETURN(const ImageSize size, ReadImageSize(image->name, image->encoded.bytes()));
+      first_texel.push_back(total);
+      total += uint64_t{size.width} * size.height;
+    }
+    if (total > kMaxTexels) {
+      return absl::ResourceExhaustedError("the textures have " + std::to_string(total) +
+                                          " texels, more than 2^30; make them smaller");
     }
     std::vector<absl::StatusOr<DecodedImage>> decoded(images.size(), absl::UnknownError(""));
     executor_.ForEach(images.size(), 1, [&](size_t i) {
       decoded[i] = DecodeImage(images[i]->name, images[i]->encoded.bytes());
     });
-    std::vector<uint64_t> first_texel;
-    uint64_t total = 0;
-    for (const auto& image : decoded) {
-      if (!image.ok()) return image.status();
-      first_texel.push_back(total);
-      total += image->texels.size();
-    }
-    if (total > kMaxTexels) {
-      return absl::ResourceExhaustedError("the textures have " + std::to_string(total) +
-                                          " texels, more than 2^31; make them smaller");
-    }
     texels_.reserve(total);
     for (const auto& image : decoded) {
+      if (!image.ok()) return image.status();
       texels_.insert(texels_.end(), image->texels.begin(), image->texels.end());
     }
     for (size_t t = 0; t < source_textures_.size(); ++t) {
@@ -439,7 +447,8 @@ class Builder {
     if (material.base_color_texture >= 0) {
       const PreparedTexture& t = textures_[static_cast<size_t>(material.base_color_texture)];
       const uint64_t count = uint64_t{t.width} * t.height;
-      for (uint64_t i = 0; i < count; ++i) least = std::min(least, texels_[t.first_texel + i] >> 24);
+      for (uint64_t i = 0; i < count; ++i)
+        least = std::min(least, texels_[t.first_texel + i] >> 24);
     }
     // The margin covers the rounding of the interpolation.
     const float alpha = material.base_alpha * (static_cast<float>(least) / 255.0f);
@@ -491,8 +500,10 @@ class Builder {
   // Runs body(begin, end) over [0, count), in parallel where that is worth its while.
   template <typename Body>
   void ForPieces(size_t count, const Body& body) {
-    if (count <= kPiece) body(size_t{0}, count);
-    else executor_.ForEachPiece(count, kPiece, body);
+    if (count <= kPiece)
+      body(size_t{0}, count);
+    else
+      executor_.ForEachPiece(count, kPiece, body);
   }
 
   void AppendVertices(const Instance& instance, const Mesh& mesh) {
@@ -669,9 +680,9 @@ absl::Status PreparedScene::Read() {
   if (magic != kMagic) return absl::DataLossError("byte 0: this is not a prepared scene");
   FP_RETURN_IF_ERROR(r.Get(version, "version"));
   if (version != kVersion) {
-    return absl::FailedPreconditionError(
-        "byte 8: has format version " + std::to_string(version) + ", this program reads " +
-        std::to_string(kVersion) + "; run the same farpoint version everywhere");
+    return absl::FailedPreconditionError("byte 8: has format version " + std::to_string(version) +
+                                         ", this program reads " + std::to_string(kVersion) +
+                                         "; run the same farpoint version everywhere");
   }
   FP_RETURN_IF_ERROR(r.Get(reserved, "reserved"));
   FP_RETURN_IF_ERROR(r.Get(origin_, "origin"));
@@ -783,9 +794,9 @@ absl::Status PreparedScene::CheckGeometry() {
         good = object.has_normals == 0 || std::fabs(Length2(normals_[v]) - 1.0f) < 1e-3f;
         bounds_.Extend(vertices_[v]);
       }
-      good = good && !IsDegenerate(vertices_[triangle.vertex[0]], vertices_[triangle.vertex[1]],
-                                   vertices_[triangle.vertex[2]],
-                                   std::numeric_limits<float>::min());
+      good =
+          good && !IsDegenerate(vertices_[triangle.vertex[0]], vertices_[triangle.vertex[1]],
+                                vertices_[triangle.vertex[2]], std::numeric_limits<float>::min());
       if (!good) return BadBlob("triangle " + std::to_string(t) + " has a value out of range");
       if (emits) emissive_triangles_.push_back(static_cast<uint32_t>(t));
     }
@@ -803,8 +814,8 @@ Vec3f PreparedScene::GeometricNormal(uint32_t triangle) const {
 
 float PreparedScene::TriangleArea(uint32_t triangle) const {
   const auto& v = triangles_[triangle].vertex;
-  return static_cast<float>(
-      0.5 * Length(CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]])));
+  return static_cast<float>(0.5 *
+                            Length(CrossOf(vertices_[v[0]], vertices_[v[1]], vertices_[v[2]])));
 }
 
 Vec3f PreparedScene::PointOn(uint32_t triangle, float b1, float b2) const {

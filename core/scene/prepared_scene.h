@@ -31,21 +31,21 @@ struct PreparedTriangle {
 struct PreparedObject {
   uint64_t first_triangle, triangle_count;
   uint32_t material;
-  uint32_t has_normals;   // 1: vertex normals are valid; 0: flat
-  uint64_t content_key;   // hash of the mesh's geometry and the instance's linear transform, each
-                          // without its power of two: seeds sampling, unchanged when the object
-                          // only moves, its peers change or the scene is scaled by 2^n
+  uint32_t has_normals;  // 1: vertex normals are valid; 0: flat
+  uint64_t content_key;  // hash of the mesh's geometry and the instance's linear transform, each
+                         // without its power of two: seeds sampling, unchanged when the object
+                         // only moves, its peers change or the scene is scaled by 2^n
 };
 
 struct PreparedMaterial {
   Rgb base_color;
-  float alpha_cutoff;          // < 0: opaque
+  float alpha_cutoff;  // < 0: opaque
   Rgb emission;
   float base_alpha;
   int32_t base_color_texture;  // -1: none
   int32_t emission_texture;
   uint32_t base_color_uv_set, emission_uv_set;
-  float base_color_uv[6];      // rows of the 2x3 matrix on (u, v, 1)
+  float base_color_uv[6];  // rows of the 2x3 matrix on (u, v, 1)
   float emission_uv[6];
 };
 
@@ -58,11 +58,11 @@ struct PreparedTexture {
 };
 
 struct PreparedLight {
-  uint32_t kind;  // PunctualKind
+  uint32_t kind;    // PunctualKind
   Vec3f position;   // relative to origin
   Vec3f direction;  // unit, the way the light travels
   Rgb intensity;
-  float range_m;    // 0: infinite
+  float range_m;  // 0: infinite
   float cos_inner, cos_outer;
   float reserved;
 };

@@ -25,35 +25,45 @@ enum CornellMaterial : int32_t { kWhite, kRed, kGreen, kLight };
 // quads round the light, which fills the hole in its plane.
 std::vector<CornellObject> CornellObjects() {
   return {
-      {"floor", kWhite,
-       {{{{5.528f, 0, 0}, {0, 0, 0}, {0, 0, 5.592f}, {5.496f, 0, 5.592f}}}}},
-      {"ceiling", kWhite,
+      {"floor", kWhite, {{{{5.528f, 0, 0}, {0, 0, 0}, {0, 0, 5.592f}, {5.496f, 0, 5.592f}}}}},
+      {"ceiling",
+       kWhite,
        {{{{5.56f, 5.488f, 0}, {5.56f, 5.488f, 2.27f}, {0, 5.488f, 2.27f}, {0, 5.488f, 0}}},
-        {{{5.56f, 5.488f, 3.32f}, {5.56f, 5.488f, 5.592f}, {0, 5.488f, 5.592f},
+        {{{5.56f, 5.488f, 3.32f},
+          {5.56f, 5.488f, 5.592f},
+          {0, 5.488f, 5.592f},
           {0, 5.488f, 3.32f}}},
-        {{{5.56f, 5.488f, 2.27f}, {5.56f, 5.488f, 3.32f}, {3.43f, 5.488f, 3.32f},
+        {{{5.56f, 5.488f, 2.27f},
+          {5.56f, 5.488f, 3.32f},
+          {3.43f, 5.488f, 3.32f},
           {3.43f, 5.488f, 2.27f}}},
-        {{{2.13f, 5.488f, 2.27f}, {2.13f, 5.488f, 3.32f}, {0, 5.488f, 3.32f},
+        {{{2.13f, 5.488f, 2.27f},
+          {2.13f, 5.488f, 3.32f},
+          {0, 5.488f, 3.32f},
           {0, 5.488f, 2.27f}}}}},
-      {"light", kLight,
-       {{{{3.43f, 5.488f, 2.27f}, {3.43f, 5.488f, 3.32f}, {2.13f, 5.488f, 3.32f},
+      {"light",
+       kLight,
+       {{{{3.43f, 5.488f, 2.27f},
+          {3.43f, 5.488f, 3.32f},
+          {2.13f, 5.488f, 3.32f},
           {2.13f, 5.488f, 2.27f}}}}},
-      {"back", kWhite,
+      {"back",
+       kWhite,
        {{{{5.496f, 0, 5.592f}, {0, 0, 5.592f}, {0, 5.488f, 5.592f}, {5.56f, 5.488f, 5.592f}}}}},
-      {"right", kGreen,
-       {{{{0, 0, 5.592f}, {0, 0, 0}, {0, 5.488f, 0}, {0, 5.488f, 5.592f}}}}},
-      {"left", kRed,
+      {"right", kGreen, {{{{0, 0, 5.592f}, {0, 0, 0}, {0, 5.488f, 0}, {0, 5.488f, 5.592f}}}}},
+      {"left",
+       kRed,
        {{{{5.528f, 0, 0}, {5.496f, 0, 5.592f}, {5.56f, 5.488f, 5.592f}, {5.56f, 5.488f, 0}}}}},
-      {"short", kWhite,
-       {{{{1.3f, 1.65f, 0.65f}, {0.82f, 1.65f, 2.25f}, {2.4f, 1.65f, 2.72f},
-          {2.9f, 1.65f, 1.14f}}},
+      {"short",
+       kWhite,
+       {{{{1.3f, 1.65f, 0.65f}, {0.82f, 1.65f, 2.25f}, {2.4f, 1.65f, 2.72f}, {2.9f, 1.65f, 1.14f}}},
         {{{2.9f, 0, 1.14f}, {2.9f, 1.65f, 1.14f}, {2.4f, 1.65f, 2.72f}, {2.4f, 0, 2.72f}}},
         {{{1.3f, 0, 0.65f}, {1.3f, 1.65f, 0.65f}, {2.9f, 1.65f, 1.14f}, {2.9f, 0, 1.14f}}},
         {{{0.82f, 0, 2.25f}, {0.82f, 1.65f, 2.25f}, {1.3f, 1.65f, 0.65f}, {1.3f, 0, 0.65f}}},
         {{{2.4f, 0, 2.72f}, {2.4f, 1.65f, 2.72f}, {0.82f, 1.65f, 2.25f}, {0.82f, 0, 2.25f}}}}},
-      {"tall", kWhite,
-       {{{{4.23f, 3.3f, 2.47f}, {2.65f, 3.3f, 2.96f}, {3.14f, 3.3f, 4.56f},
-          {4.72f, 3.3f, 4.06f}}},
+      {"tall",
+       kWhite,
+       {{{{4.23f, 3.3f, 2.47f}, {2.65f, 3.3f, 2.96f}, {3.14f, 3.3f, 4.56f}, {4.72f, 3.3f, 4.06f}}},
         {{{4.23f, 0, 2.47f}, {4.23f, 3.3f, 2.47f}, {4.72f, 3.3f, 4.06f}, {4.72f, 0, 4.06f}}},
         {{{4.72f, 0, 4.06f}, {4.72f, 3.3f, 4.06f}, {3.14f, 3.3f, 4.56f}, {3.14f, 0, 4.56f}}},
         {{{3.14f, 0, 4.56f}, {3.14f, 3.3f, 4.56f}, {2.65f, 3.3f, 2.96f}, {2.65f, 0, 2.96f}}},
@@ -88,10 +98,9 @@ Material Lambert(const char* name, const Rgb& albedo, const Rgb& emission = {}) 
 Scene MakeCornellBox() {
   Scene scene;
   scene.name = "cornell";
-  scene.materials = {Lambert("white", {0.725f, 0.71f, 0.68f}),
-                     Lambert("red", {0.63f, 0.065f, 0.05f}),
-                     Lambert("green", {0.14f, 0.45f, 0.091f}),
-                     Lambert("light", {0, 0, 0}, {17, 12, 4})};
+  scene.materials = {
+      Lambert("white", {0.725f, 0.71f, 0.68f}), Lambert("red", {0.63f, 0.065f, 0.05f}),
+      Lambert("green", {0.14f, 0.45f, 0.091f}), Lambert("light", {0, 0, 0}, {17, 12, 4})};
   for (const CornellObject& object : CornellObjects()) {
     const auto mesh = static_cast<uint32_t>(scene.meshes.size());
     scene.meshes.push_back(MeshOfQuads(object.name, object.material, object.quads));
@@ -114,13 +123,12 @@ Scene MakeFurnace(float rho, float radiance) {
   scene.name = "furnace";
   scene.materials = {Lambert("furnace", Rgb(rho), Rgb(radiance))};
   // Wound so that the fronts face inwards.
-  const std::vector<Quad> walls = {
-      {{{-1, -1, -1}, {-1, -1, 1}, {1, -1, 1}, {1, -1, -1}}},
-      {{{-1, 1, -1}, {1, 1, -1}, {1, 1, 1}, {-1, 1, 1}}},
-      {{{-1, -1, -1}, {1, -1, -1}, {1, 1, -1}, {-1, 1, -1}}},
-      {{{-1, -1, 1}, {-1, 1, 1}, {1, 1, 1}, {1, -1, 1}}},
-      {{{-1, -1, -1}, {-1, 1, -1}, {-1, 1, 1}, {-1, -1, 1}}},
-      {{{1, -1, -1}, {1, -1, 1}, {1, 1, 1}, {1, 1, -1}}}};
+  const std::vector<Quad> walls = {{{{-1, -1, -1}, {-1, -1, 1}, {1, -1, 1}, {1, -1, -1}}},
+                                   {{{-1, 1, -1}, {1, 1, -1}, {1, 1, 1}, {-1, 1, 1}}},
+                                   {{{-1, -1, -1}, {1, -1, -1}, {1, 1, -1}, {-1, 1, -1}}},
+                                   {{{-1, -1, 1}, {-1, 1, 1}, {1, 1, 1}, {1, -1, 1}}},
+                                   {{{-1, -1, -1}, {-1, 1, -1}, {-1, 1, 1}, {-1, -1, 1}}},
+                                   {{{1, -1, -1}, {1, -1, 1}, {1, 1, 1}, {1, 1, -1}}}};
   scene.meshes.push_back(MeshOfQuads("walls", 0, walls));
   scene.instances.push_back({"walls", 0, {}});
   Camera camera;

@@ -17,27 +17,45 @@ namespace farpoint {
 namespace {
 
 // Plan of the streets.
-constexpr double kPitch = 60;        // from street to street
-constexpr double kKerbHalf = 25.5;   // half of a block with its pavements
-constexpr double kLotHalf = 22;      // half of what is built upon
+constexpr double kPitch = 60;       // from street to street
+constexpr double kKerbHalf = 25.5;  // half of a block with its pavements
+constexpr double kLotHalf = 22;     // half of what is built upon
 constexpr double kKerbHeight = 0.15;
-constexpr double kMargin = 16;       // of the ground beyond the outermost streets' axes
+constexpr double kMargin = 16;  // of the ground beyond the outermost streets' axes
 
 // Plan of a building, in the frame of its lot: the street corner is (0, 0), the streets run along
 // +x and +z. The plan is an L round the courtyard.
-constexpr double kSide = 22;         // along each street
-constexpr double kDepth = 13;        // from the street to the courtyard
+constexpr double kSide = 22;   // along each street
+constexpr double kDepth = 13;  // from the street to the courtyard
 constexpr double kFloorHeight = 3.5;
 constexpr double kGroundHeight = 4.4;
-constexpr double kBay = 4.4;         // width of a bay; about
+constexpr double kBay = 4.4;  // width of a bay; about
 constexpr double kArcadeDepth = 3.0;
 constexpr double kWallThickness = 0.5;
 
 enum CityMaterial : int32_t {
-  kAsphalt, kPaint, kPavement, kKerb, kGrass, kGravel, kWater,
-  kStone, kGlass, kFrame, kSlate, kTiles, kRoofFelt, kMetal, kDarkMetal, kBark, kRubber,
-  kFirstLeaves, kFirstWall = kFirstLeaves + 3, kFirstAccent = kFirstWall + 10,
-  kFirstPaintwork = kFirstAccent + 4, kMaterialCount = kFirstPaintwork + 5
+  kAsphalt,
+  kPaint,
+  kPavement,
+  kKerb,
+  kGrass,
+  kGravel,
+  kWater,
+  kStone,
+  kGlass,
+  kFrame,
+  kSlate,
+  kTiles,
+  kRoofFelt,
+  kMetal,
+  kDarkMetal,
+  kBark,
+  kRubber,
+  kFirstLeaves,
+  kFirstWall = kFirstLeaves + 3,
+  kFirstAccent = kFirstWall + 10,
+  kFirstPaintwork = kFirstAccent + 4,
+  kMaterialCount = kFirstPaintwork + 5
 };
 
 struct NamedColor {
@@ -49,44 +67,25 @@ constexpr int kWallColors = 10, kAccentColors = 4, kPaintworks = 5, kLeafColors 
 
 std::vector<Material> CityMaterials() {
   const NamedColor colors[kMaterialCount] = {
-      {"asphalt", {0.085f, 0.085f, 0.09f}},
-      {"road paint", {0.62f, 0.61f, 0.57f}},
-      {"pavement", {0.36f, 0.345f, 0.32f}},
-      {"kerb", {0.48f, 0.47f, 0.45f}},
-      {"grass", {0.11f, 0.21f, 0.045f}},
-      {"gravel", {0.52f, 0.46f, 0.36f}},
-      {"water", {0.06f, 0.14f, 0.17f}},
-      {"stone", {0.64f, 0.6f, 0.53f}},
-      {"glass", {0.05f, 0.07f, 0.085f}},
-      {"frame", {0.7f, 0.69f, 0.66f}},
-      {"slate", {0.13f, 0.14f, 0.165f}},
-      {"tiles", {0.46f, 0.17f, 0.09f}},
-      {"roof felt", {0.27f, 0.265f, 0.255f}},
-      {"metal", {0.5f, 0.51f, 0.52f}},
-      {"dark metal", {0.07f, 0.08f, 0.08f}},
-      {"bark", {0.16f, 0.105f, 0.065f}},
-      {"rubber", {0.03f, 0.03f, 0.03f}},
-      {"leaves 0", {0.1f, 0.21f, 0.04f}},
-      {"leaves 1", {0.15f, 0.25f, 0.05f}},
-      {"leaves 2", {0.07f, 0.16f, 0.045f}},
-      {"plaster cream", {0.74f, 0.63f, 0.45f}},
-      {"plaster ochre", {0.7f, 0.47f, 0.2f}},
-      {"brick red", {0.42f, 0.155f, 0.095f}},
-      {"plaster blue", {0.42f, 0.54f, 0.66f}},
-      {"plaster mint", {0.47f, 0.61f, 0.46f}},
-      {"plaster rose", {0.72f, 0.44f, 0.38f}},
-      {"plaster white", {0.76f, 0.74f, 0.69f}},
-      {"sandstone", {0.57f, 0.49f, 0.38f}},
-      {"terracotta", {0.64f, 0.29f, 0.155f}},
-      {"brick brown", {0.3f, 0.2f, 0.14f}},
-      {"awning red", {0.56f, 0.055f, 0.045f}},
-      {"awning green", {0.05f, 0.27f, 0.1f}},
-      {"awning blue", {0.055f, 0.13f, 0.42f}},
-      {"awning yellow", {0.7f, 0.47f, 0.06f}},
-      {"paintwork white", {0.7f, 0.7f, 0.7f}},
-      {"paintwork grey", {0.2f, 0.21f, 0.22f}},
-      {"paintwork red", {0.45f, 0.03f, 0.03f}},
-      {"paintwork blue", {0.05f, 0.1f, 0.32f}},
+      {"asphalt", {0.085f, 0.085f, 0.09f}},       {"road paint", {0.62f, 0.61f, 0.57f}},
+      {"pavement", {0.36f, 0.345f, 0.32f}},       {"kerb", {0.48f, 0.47f, 0.45f}},
+      {"grass", {0.11f, 0.21f, 0.045f}},          {"gravel", {0.52f, 0.46f, 0.36f}},
+      {"water", {0.06f, 0.14f, 0.17f}},           {"stone", {0.64f, 0.6f, 0.53f}},
+      {"glass", {0.05f, 0.07f, 0.085f}},          {"frame", {0.7f, 0.69f, 0.66f}},
+      {"slate", {0.13f, 0.14f, 0.165f}},          {"tiles", {0.46f, 0.17f, 0.09f}},
+      {"roof felt", {0.27f, 0.265f, 0.255f}},     {"metal", {0.5f, 0.51f, 0.52f}},
+      {"dark metal", {0.07f, 0.08f, 0.08f}},      {"bark", {0.16f, 0.105f, 0.065f}},
+      {"rubber", {0.03f, 0.03f, 0.03f}},          {"leaves 0", {0.1f, 0.21f, 0.04f}},
+      {"leaves 1", {0.15f, 0.25f, 0.05f}},        {"leaves 2", {0.07f, 0.16f, 0.045f}},
+      {"plaster cream", {0.74f, 0.63f, 0.45f}},   {"plaster ochre", {0.7f, 0.47f, 0.2f}},
+      {"brick red", {0.42f, 0.155f, 0.095f}},     {"plaster blue", {0.42f, 0.54f, 0.66f}},
+      {"plaster mint", {0.47f, 0.61f, 0.46f}},    {"plaster rose", {0.72f, 0.44f, 0.38f}},
+      {"plaster white", {0.76f, 0.74f, 0.69f}},   {"sandstone", {0.57f, 0.49f, 0.38f}},
+      {"terracotta", {0.64f, 0.29f, 0.155f}},     {"brick brown", {0.3f, 0.2f, 0.14f}},
+      {"awning red", {0.56f, 0.055f, 0.045f}},    {"awning green", {0.05f, 0.27f, 0.1f}},
+      {"awning blue", {0.055f, 0.13f, 0.42f}},    {"awning yellow", {0.7f, 0.47f, 0.06f}},
+      {"paintwork white", {0.7f, 0.7f, 0.7f}},    {"paintwork grey", {0.2f, 0.21f, 0.22f}},
+      {"paintwork red", {0.45f, 0.03f, 0.03f}},   {"paintwork blue", {0.05f, 0.1f, 0.32f}},
       {"paintwork yellow", {0.68f, 0.48f, 0.03f}}};
   std::vector<Material> materials;
   for (const NamedColor& color : colors) {
@@ -111,9 +110,22 @@ int RandomInt(int count, Key... key) {
 
 // What a number decides; part of its key.
 enum Choice : uint64_t {
-  kWallChoice = 1, kFloorsChoice, kArcadeChoice, kRoofChoice, kAccentChoice, kBalconyChoice,
-  kRoofObjectChoice, kShopChoice, kVariantChoice, kMirrorChoice, kParkChoice, kTreeChoice,
-  kCarChoice, kLeafChoice, kWindowChoice, kLampChoice
+  kWallChoice = 1,
+  kFloorsChoice,
+  kArcadeChoice,
+  kRoofChoice,
+  kAccentChoice,
+  kBalconyChoice,
+  kRoofObjectChoice,
+  kShopChoice,
+  kVariantChoice,
+  kMirrorChoice,
+  kParkChoice,
+  kTreeChoice,
+  kCarChoice,
+  kLeafChoice,
+  kWindowChoice,
+  kLampChoice
 };
 
 // Triangles of one material.
@@ -135,7 +147,8 @@ class Solid {
   void Box(const Vec3d& min, const Vec3d& max, bool with_bottom = false) {
     const double x[2] = {min.x, max.x}, y[2] = {min.y, max.y}, z[2] = {min.z, max.z};
     const auto first = static_cast<uint32_t>(positions_.size());
-    for (int i = 0; i < 8; ++i) positions_.emplace_back(Vec3f(Vec3d(x[i & 1], y[i >> 1 & 1], z[i >> 2])));
+    for (int i = 0; i < 8; ++i)
+      positions_.emplace_back(Vec3f(Vec3d(x[i & 1], y[i >> 1 & 1], z[i >> 2])));
     const std::array<uint32_t, 4> faces[6] = {{2, 6, 7, 3}, {0, 2, 3, 1}, {4, 5, 7, 6},
                                               {0, 4, 6, 2}, {1, 3, 7, 5}, {0, 1, 5, 4}};
     for (int f = 0; f < (with_bottom ? 6 : 5); ++f) {
@@ -221,15 +234,23 @@ void Ledge(Solid& solid, const Facade& f, double u0, double v0, double u1, doubl
   solid.Quad(f.At(u1, v0, depth), f.At(u1, v0), f.At(u1, v1), f.At(u1, v1, depth));
 }
 
-enum Part { kWallPart, kStonePart, kGlassPart, kFramePart, kRoofPart, kAccentPart, kMetalPart,
-            kPartCount };
+enum Part {
+  kWallPart,
+  kStonePart,
+  kGlassPart,
+  kFramePart,
+  kRoofPart,
+  kAccentPart,
+  kMetalPart,
+  kPartCount
+};
 
 struct BuildingStyle {
   uint64_t seed;
   int wall, accent, roof_material;
-  int floors;      // above the ground floor
+  int floors;  // above the ground floor
   bool arcade, mansard, balconies, tall_windows;
-  int setback;     // floors above which the building steps back; 0: none
+  int setback;  // floors above which the building steps back; 0: none
 };
 
 class Building {
@@ -255,10 +276,11 @@ class Building {
 
   // Adds one mesh for each material that the building has.
   std::vector<uint32_t> AddTo(Scene& scene, const std::string& name) const {
-    const int32_t material[kPartCount] = {kFirstWall + s_.wall, kStone, kGlass, kFrame,
-                                          s_.roof_material, kFirstAccent + s_.accent, kMetal};
-    const char* part_name[kPartCount] = {"walls", "stone", "glass", "frames", "roof", "awnings",
-                                         "metal"};
+    const int32_t material[kPartCount] = {
+        kFirstWall + s_.wall,     kStone, kGlass, kFrame, s_.roof_material,
+        kFirstAccent + s_.accent, kMetal};
+    const char* part_name[kPartCount] = {"walls", "stone",   "glass", "frames",
+                                         "roof",  "awnings", "metal"};
     std::vector<uint32_t> meshes;
     for (int p = 0; p < kPartCount; ++p) {
       if (parts_[p].empty()) continue;
@@ -472,11 +494,14 @@ class Building {
     constexpr double kIn = 2.2, kUp = 3.0;
     const double top = eaves + kUp;
     Solid& roof = parts_[kRoofPart];
-    const Vec3d outer[6] = {{0, eaves, 0}, {0, eaves, kSide}, {kDepth, eaves, kSide},
+    const Vec3d outer[6] = {{0, eaves, 0},           {0, eaves, kSide},      {kDepth, eaves, kSide},
                             {kDepth, eaves, kDepth}, {kSide, eaves, kDepth}, {kSide, eaves, 0}};
-    const Vec3d inner[6] = {{kIn, top, kIn}, {kIn, top, kSide - kIn},
-                            {kDepth - kIn, top, kSide - kIn}, {kDepth - kIn, top, kDepth - kIn},
-                            {kSide - kIn, top, kDepth - kIn}, {kSide - kIn, top, kIn}};
+    const Vec3d inner[6] = {{kIn, top, kIn},
+                            {kIn, top, kSide - kIn},
+                            {kDepth - kIn, top, kSide - kIn},
+                            {kDepth - kIn, top, kDepth - kIn},
+                            {kSide - kIn, top, kDepth - kIn},
+                            {kSide - kIn, top, kIn}};
     for (int i = 0; i < 6; ++i) {
       const int j = (i + 1) % 6;
       roof.Quad(outer[i], outer[j], inner[j], inner[i]);
@@ -553,8 +578,7 @@ BuildingStyle StyleOf(uint64_t seed, int variant, int variants) {
   s.floors = 2 + RandomInt(3, s.seed, kFloorsChoice);
   s.arcade = variant % 3 == 1;
   s.mansard = variant % 5 < 2;
-  s.roof_material = s.mansard ? (variant % 5 == 0 ? kSlate : kTiles)
-                              : kRoofFelt;
+  s.roof_material = s.mansard ? (variant % 5 == 0 ? kSlate : kTiles) : kRoofFelt;
   s.balconies = variant % 4 == 3;
   s.tall_windows = RandomInt(2, s.seed, kWindowChoice) == 0;
   // The last few of the library are the tall ones of the centre.
@@ -572,12 +596,13 @@ BuildingStyle StyleOf(uint64_t seed, int variant, int variants) {
 // Smooth normals.
 void AddLump(Mesh& mesh, const Vec3d& center, const Vec3d& radius, bool fine, uint64_t seed) {
   const double t = 0.5 * (1 + std::sqrt(5.0));
-  std::vector<Vec3d> p = {{-1, t, 0}, {1, t, 0}, {-1, -t, 0}, {1, -t, 0}, {0, -1, t}, {0, 1, t},
-                          {0, -1, -t}, {0, 1, -t}, {t, 0, -1}, {t, 0, 1}, {-t, 0, -1}, {-t, 0, 1}};
-  constexpr int kFaces[20][3] = {{0, 11, 5}, {0, 5, 1}, {0, 1, 7}, {0, 7, 10}, {0, 10, 11},
-                                 {1, 5, 9}, {5, 11, 4}, {11, 10, 2}, {10, 7, 6}, {7, 1, 8},
-                                 {3, 9, 4}, {3, 4, 2}, {3, 2, 6}, {3, 6, 8}, {3, 8, 9},
-                                 {4, 9, 5}, {2, 4, 11}, {6, 2, 10}, {8, 6, 7}, {9, 8, 1}};
+  std::vector<Vec3d> p = {{-1, t, 0}, {1, t, 0}, {-1, -t, 0}, {1, -t, 0},
+                          {0, -1, t}, {0, 1, t}, {0, -1, -t}, {0, 1, -t},
+                          {t, 0, -1}, {t, 0, 1}, {-t, 0, -1}, {-t, 0, 1}};
+  constexpr int kFaces[20][3] = {{0, 11, 5}, {0, 5, 1},  {0, 1, 7},   {0, 7, 10}, {0, 10, 11},
+                                 {1, 5, 9},  {5, 11, 4}, {11, 10, 2}, {10, 7, 6}, {7, 1, 8},
+                                 {3, 9, 4},  {3, 4, 2},  {3, 2, 6},   {3, 6, 8},  {3, 8, 9},
+                                 {4, 9, 5},  {2, 4, 11}, {6, 2, 10},  {8, 6, 7},  {9, 8, 1}};
   std::vector<std::array<uint32_t, 3>> triangles;
   std::vector<std::pair<std::pair<int, int>, int>> middles;
   const auto middle = [&](int a, int b) {
@@ -592,14 +617,14 @@ void AddLump(Mesh& mesh, const Vec3d& center, const Vec3d& radius, bool fine, ui
   for (const auto& face : kFaces) {
     const int a = face[0], b = face[1], c = face[2];
     if (!fine) {
-      triangles.push_back({static_cast<uint32_t>(a), static_cast<uint32_t>(b),
-                           static_cast<uint32_t>(c)});
+      triangles.push_back(
+          {static_cast<uint32_t>(a), static_cast<uint32_t>(b), static_cast<uint32_t>(c)});
       continue;
     }
     const int ab = middle(a, b), bc = middle(b, c), ca = middle(c, a);
     for (const auto& f : {std::array<int, 3>{a, ab, ca}, {b, bc, ab}, {c, ca, bc}, {ab, bc, ca}}) {
-      triangles.push_back({static_cast<uint32_t>(f[0]), static_cast<uint32_t>(f[1]),
-                           static_cast<uint32_t>(f[2])});
+      triangles.push_back(
+          {static_cast<uint32_t>(f[0]), static_cast<uint32_t>(f[1]), static_cast<uint32_t>(f[2])});
     }
   }
   const auto first = static_cast<uint32_t>(mesh.positions.size());
@@ -693,8 +718,8 @@ class City {
     kerb.Box({-kKerbHalf, 0, in}, {kKerbHalf, kKerbHeight, kKerbHalf});
     kerb.Box({-kKerbHalf, 0, -in}, {-in, kKerbHeight, in});
     kerb.Box({in, 0, -in}, {kKerbHalf, kKerbHeight, in});
-    slab_ = {"pavement", {AddMesh(slab.ToMesh("pavement", kPavement)),
-                          AddMesh(kerb.ToMesh("kerb", kKerb))}};
+    slab_ = {"pavement",
+             {AddMesh(slab.ToMesh("pavement", kPavement)), AddMesh(kerb.ToMesh("kerb", kKerb))}};
     Solid yard;
     const double y = kKerbHeight + 0.02, h = kSide - kDepth;
     yard.Quad({-h, y, -h}, {-h, y, h}, {h, y, h}, {h, y, -h});
@@ -715,8 +740,9 @@ class City {
     AddLump(crown, {0.8, height + 2.8, 0.4}, {1.2, 1.3, 1.2}, false, HashKey(seed, 2));
     AddLump(crown, {-0.7, height + 0.9, -0.8}, {1.2, 1.0, 1.2}, false, HashKey(seed, 3));
     const std::string name = "tree " + std::to_string(v);
-    return {name, {AddMesh(trunk.ToMesh("trunk " + std::to_string(v), kBark)),
-                   AddMesh(std::move(crown))}};
+    return {
+        name,
+        {AddMesh(trunk.ToMesh("trunk " + std::to_string(v), kBark)), AddMesh(std::move(crown))}};
   }
 
   // Leans over +x.
@@ -726,8 +752,9 @@ class City {
     solid.Box({-0.05, 5.1, -0.05}, {1.3, 5.2, 0.05}, true);
     Solid head;
     head.Box({0.9, 4.95, -0.14}, {1.5, 5.1, 0.14}, true);
-    return {"lamp", {AddMesh(solid.ToMesh("lamp post", kDarkMetal)),
-                     AddMesh(head.ToMesh("lamp head", kFrame))}};
+    return {"lamp",
+            {AddMesh(solid.ToMesh("lamp post", kDarkMetal)),
+             AddMesh(head.ToMesh("lamp head", kFrame))}};
   }
 
   Model Bench() {
@@ -736,8 +763,9 @@ class City {
     wood.Box({-0.8, 0.62, 0.2}, {0.8, 0.9, 0.25}, true);
     iron.Box({-0.65, 0, -0.18}, {-0.55, 0.42, 0.2});
     iron.Box({0.55, 0, -0.18}, {0.65, 0.42, 0.2});
-    return {"bench", {AddMesh(wood.ToMesh("bench seat", kBark)),
-                      AddMesh(iron.ToMesh("bench legs", kDarkMetal))}};
+    return {"bench",
+            {AddMesh(wood.ToMesh("bench seat", kBark)),
+             AddMesh(iron.ToMesh("bench legs", kDarkMetal))}};
   }
 
   // A car along z, its front at +z. One set of meshes for each paintwork.
@@ -748,14 +776,14 @@ class City {
     };
     constexpr Station kRoofLine[] = {{-2.05, 0.55, 0.82}, {-2.0, 0.92, 0.84}, {-1.55, 1.0, 0.84},
                                      {-1.05, 1.46, 0.68}, {0.35, 1.48, 0.68}, {1.05, 0.98, 0.84},
-                                     {1.95, 0.84, 0.8}, {2.1, 0.5, 0.78}};
+                                     {1.95, 0.84, 0.8},   {2.1, 0.5, 0.78}};
     constexpr double kBelly = 0.24, kBelt = 0.95;
     constexpr int kStations = 8;
     for (int i = 0; i + 1 < kStations; ++i) {
       const Station &a = kRoofLine[i], &b = kRoofLine[i + 1];
       const bool screen = i == 2 || i == 4;
-      (screen ? windows : body).Quad({-a.half, a.y, a.z}, {-b.half, b.y, b.z}, {b.half, b.y, b.z},
-                                     {a.half, a.y, a.z});
+      (screen ? windows : body)
+          .Quad({-a.half, a.y, a.z}, {-b.half, b.y, b.z}, {b.half, b.y, b.z}, {a.half, a.y, a.z});
       const double ya = std::min(a.y, kBelt), yb = std::min(b.y, kBelt);
       const double wa = a.y > kBelt ? 0.84 : a.half, wb = b.y > kBelt ? 0.84 : b.half;
       for (const double s : {-1.0, 1.0}) {
@@ -799,8 +827,8 @@ class City {
     const uint32_t rubber = AddMesh(wheels.ToMesh("car wheels", kRubber));
     for (int c = 0; c < kPaintworks; ++c) {
       const std::string name = "car " + std::to_string(c);
-      cars_.push_back({name, {AddMesh(body.ToMesh(name + " body", kFirstPaintwork + c)), glass,
-                              rubber}});
+      cars_.push_back(
+          {name, {AddMesh(body.ToMesh(name + " body", kFirstPaintwork + c)), glass, rubber}});
     }
   }
 
@@ -822,9 +850,10 @@ class City {
     basin.Prism({}, 12, 0.35, y + 0.7, 0.25, y + 1.9);
     basin.Prism({}, 12, 0.4, y + 1.7, 1.1, y + 2.1);
     basin.Prism({}, 12, 0.2, y + 2.1, 0.1, y + 2.9);
-    return {"park", {AddMesh(grass.ToMesh("lawn", kGrass)), AddMesh(gravel.ToMesh("path", kGravel)),
-                     AddMesh(basin.ToMesh("fountain", kStone)),
-                     AddMesh(water.ToMesh("fountain water", kWater))}};
+    return {"park",
+            {AddMesh(grass.ToMesh("lawn", kGrass)), AddMesh(gravel.ToMesh("path", kGravel)),
+             AddMesh(basin.ToMesh("fountain", kStone)),
+             AddMesh(water.ToMesh("fountain water", kWater))}};
   }
 
   // Of a street along z, from one crossing to the next: the centre line and two zebra crossings.
@@ -878,12 +907,13 @@ class City {
 
   void ParkCars(int i, int j, int direction) {
     for (int slot = 0; slot < 6; ++slot) {
-      const uint64_t key = HashKey(seed_, kCarChoice, static_cast<uint64_t>(i),
-                                   static_cast<uint64_t>(j), static_cast<uint64_t>(direction),
-                                   static_cast<uint64_t>(slot));
+      const uint64_t key =
+          HashKey(seed_, kCarChoice, static_cast<uint64_t>(i), static_cast<uint64_t>(j),
+                  static_cast<uint64_t>(direction), static_cast<uint64_t>(slot));
       if (Random(key, 0) > 0.19) continue;
       const double side = slot % 2 == 0 ? -1 : 1;
-      const double along = Street(j) + 0.5 * kPitch - 13 + 13 * (slot / 2) + 4 * (Random(key, 1) - 0.5);
+      const double along =
+          Street(j) + 0.5 * kPitch - 13 + 13 * (slot / 2) + 4 * (Random(key, 1) - 0.5);
       const double across = Street(i) + side * 3.35;
       const Model& car = cars_[static_cast<size_t>(RandomInt(kPaintworks, key, 2))];
       const int facing = side > 0 ? 2 : 0;
@@ -894,7 +924,8 @@ class City {
 
   bool IsPark(int i, int j) const {
     if (blocks_ < 2) return false;
-    return Random(seed_, kParkChoice, i, j) < 0.09 || (blocks_ >= 4 && i == blocks_ / 2 && j == blocks_ / 2 - 1);
+    return Random(seed_, kParkChoice, i, j) < 0.09 ||
+           (blocks_ >= 4 && i == blocks_ / 2 && j == blocks_ / 2 - 1);
   }
 
   void Block(int i, int j) {
@@ -925,7 +956,8 @@ class City {
     constexpr double kCornerX[4] = {-1, -1, 1, 1}, kCornerZ[4] = {-1, 1, 1, -1};
     Affine world_from_lot = Turned(corner, {center.x + kCornerX[corner] * kLotHalf, 0,
                                             center.z + kCornerZ[corner] * kLotHalf});
-    if (RandomInt(2, key, kMirrorChoice) == 1) std::swap(world_from_lot.column[0], world_from_lot.column[2]);
+    if (RandomInt(2, key, kMirrorChoice) == 1)
+      std::swap(world_from_lot.column[0], world_from_lot.column[2]);
     Place(buildings_[static_cast<size_t>(variant)], world_from_lot);
   }
 
@@ -944,14 +976,15 @@ class City {
     for (int side = 0; side < 4; ++side) {
       const Affine world_from_side = Turned(side, center);
       for (int slot = 0; slot < 4; ++slot) {
-        const uint64_t key = HashKey(seed_, kTreeChoice, static_cast<uint64_t>(i),
-                                     static_cast<uint64_t>(j), static_cast<uint64_t>(side),
-                                     static_cast<uint64_t>(slot));
+        const uint64_t key =
+            HashKey(seed_, kTreeChoice, static_cast<uint64_t>(i), static_cast<uint64_t>(j),
+                    static_cast<uint64_t>(side), static_cast<uint64_t>(slot));
         const Vec3d p = world_from_side.Point({-16.5 + 11 * slot, kKerbHeight, -kKerbHalf + 0.9});
         if (Random(key, 0) < 0.27) PlaceTree(key, p.x, p.y, p.z);
       }
       if (side % 2 == (i + j) % 2) continue;
-      const Vec3d lamp = world_from_side.Point({-11.0 + 22 * (side % 2), kKerbHeight, -kKerbHalf + 0.6});
+      const Vec3d lamp =
+          world_from_side.Point({-11.0 + 22 * (side % 2), kKerbHeight, -kKerbHalf + 0.6});
       Place(lamp_, Turned(side + 1, lamp));
     }
     if (!park) return;

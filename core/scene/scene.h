@@ -47,8 +47,8 @@ struct Material {
   float base_alpha = 1;
   TextureRef base_color_texture;  // sRGB, multiplies base_color and base_alpha
   AlphaMode alpha_mode = AlphaMode::kOpaque;
-  float alpha_cutoff = 0.5f;  // kMask: a point with alpha below it is a hole
-  Rgb emission;               // radiance, emitted from both sides (all surfaces are two-sided)
+  float alpha_cutoff = 0.5f;    // kMask: a point with alpha below it is a hole
+  Rgb emission;                 // radiance, emitted from both sides (all surfaces are two-sided)
   TextureRef emission_texture;  // sRGB, multiplies emission
   float metallic = 1, roughness = 1;  // read and kept; every material is Lambert for now
 };
@@ -56,11 +56,11 @@ struct Material {
 // One primitive: triangles of one material.
 struct Mesh {
   std::string name;
-  std::vector<Vec3f> positions;            // mesh frame
-  std::vector<Vec3f> normals;              // empty: flat; else one per position, any length
-  std::array<std::vector<Vec2f>, 2> uv;    // each empty or one per position
+  std::vector<Vec3f> positions;          // mesh frame
+  std::vector<Vec3f> normals;            // empty: flat; else one per position, any length
+  std::array<std::vector<Vec2f>, 2> uv;  // each empty or one per position
   std::vector<std::array<uint32_t, 3>> triangles;
-  int32_t material = -1;                   // -1: white Lambert, albedo 1 (the glTF default)
+  int32_t material = -1;  // -1: white Lambert, albedo 1 (the glTF default)
 };
 
 struct Instance {
@@ -74,19 +74,19 @@ enum class PunctualKind : uint32_t { kPoint, kSpot, kDirectional };
 struct PunctualLight {
   std::string name;
   PunctualKind kind = PunctualKind::kPoint;
-  Vec3d position;        // world; point and spot
-  Vec3d direction;       // world, unit, the way the light travels; spot and directional
-  Rgb intensity;         // point, spot: W/sr. directional: irradiance on a facing surface, W/m²
-  double range_m = 0;    // 0: infinite (glTF's range; window (1 - (d/range)^4) clamped to [0, 1])
+  Vec3d position;      // world; point and spot
+  Vec3d direction;     // world, unit, the way the light travels; spot and directional
+  Rgb intensity;       // point, spot: W/sr. directional: irradiance on a facing surface, W/m²
+  double range_m = 0;  // 0: infinite (glTF's range; window (1 - (d/range)^4) clamped to [0, 1])
   double inner_cone_rad = 0, outer_cone_rad = 0.7853981633974483;  // spot, glTF's falloff
 };
 
 // A perspective pinhole.
 struct Camera {
   std::string name;
-  Vec3d eye;                       // world
+  Vec3d eye;                                             // world
   Vec3d right{1, 0, 0}, up{0, 1, 0}, forward{0, 0, -1};  // orthonormal, world
-  double yfov_rad = 0.7;           // of the whole frame's height
+  double yfov_rad = 0.7;                                 // of the whole frame's height
 };
 
 struct Environment {

@@ -1,10 +1,10 @@
 #include "core/scene/asset.h"
 
-#include <filesystem>
-#include <fstream>
-
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+
+#include <filesystem>
+#include <fstream>
 
 #include "core/scene/gltf_check.h"
 #include "tests/unit/core/scene/scene_test_util.h"
@@ -18,8 +18,9 @@ using ::testing::HasSubstr;
 class AssetTest : public ::testing::Test {
  protected:
   AssetTest() {
-    folder_ = std::filesystem::path(::testing::TempDir()) /
-              ("asset_" + std::string(::testing::UnitTest::GetInstance()->current_test_info()->name()));
+    folder_ =
+        std::filesystem::path(::testing::TempDir()) /
+        ("asset_" + std::string(::testing::UnitTest::GetInstance()->current_test_info()->name()));
     std::filesystem::remove_all(folder_);
     std::filesystem::create_directories(folder_ / "textures");
   }

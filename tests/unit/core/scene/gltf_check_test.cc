@@ -33,8 +33,11 @@ TinyGltf FullGltf() {
                          {{"uri", "data:image/png;base64," + Base64(png)}}};
   gltf.json["samplers"] = {{{"wrapS", 33071}, {"magFilter", 9729}}};
   gltf.json["textures"] = {{{"source", 0}, {"sampler", 0}}, {{"source", 1}}};
-  Json material = {{"name", "m"}, {"alphaMode", "MASK"}, {"alphaCutoff", 0.5},
-                   {"emissiveFactor", {1, 1, 1}}, {"emissiveTexture", {{"index", 1}}}};
+  Json material = {{"name", "m"},
+                   {"alphaMode", "MASK"},
+                   {"alphaCutoff", 0.5},
+                   {"emissiveFactor", {1, 1, 1}},
+                   {"emissiveTexture", {{"index", 1}}}};
   material["pbrMetallicRoughness"] = {{"baseColorFactor", {1, 1, 1, 1}}};
   material["pbrMetallicRoughness"]["baseColorTexture"] = {{"index", 0}, {"texCoord", 0}};
   material["pbrMetallicRoughness"]["baseColorTexture"]["extensions"]["KHR_texture_transform"] = {
@@ -45,13 +48,17 @@ TinyGltf FullGltf() {
   Primitive(gltf)["mode"] = 4;
   gltf.json["cameras"] = {{{"type", "perspective"}, {"perspective", {{"yfov", 1}, {"znear", 1}}}}};
   gltf.json["extensions"]["KHR_lights_punctual"]["lights"] = {
-      {{"type", "spot"}, {"color", {1, 1, 1}}, {"intensity", 5}, {"range", 3},
+      {{"type", "spot"},
+       {"color", {1, 1, 1}},
+       {"intensity", 5},
+       {"range", 3},
        {"spot", {{"innerConeAngle", 0.1}, {"outerConeAngle", 0.5}}}}};
   Json light_node = {{"translation", {0, 0, 1}}, {"rotation", {0, 0, 0, 1}}, {"scale", {1, 1, 1}}};
   light_node["extensions"]["KHR_lights_punctual"]["light"] = 0;
-  gltf.json["nodes"] = {{{"mesh", 0}, {"children", {1, 2}}, {"name", "root"}},
-                        {{"camera", 0}, {"matrix", {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}}},
-                        light_node};
+  gltf.json["nodes"] = {
+      {{"mesh", 0}, {"children", {1, 2}}, {"name", "root"}},
+      {{"camera", 0}, {"matrix", {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}}},
+      light_node};
   gltf.json["scenes"][0]["extras"]["farpoint_sky"] = {1, 1, 1};
   gltf.json["extensionsUsed"] = {"KHR_lights_punctual"};
   return gltf;
@@ -185,9 +192,26 @@ TEST(CheckGltf, SurvivesEveryValueReplaced) {
   Executor executor(1);
   const TinyGltf good = FullGltf();
   const Json flat = good.json.flatten();
-  const char* values[] = {"null", "true", "-1", "0", "1", "2", "255", "1e300", "0.5", "65536",
-                          "4294967295", "18446744073709551615", "-9223372036854775808", "\"\"",
-                          "\"VEC4\"", "\"data:,\"", "[]", "[0]", "{}", "{\"a\": 1}"};
+  const char* values[] = {"null",
+                          "true",
+                          "-1",
+                          "0",
+                          "1",
+                          "2",
+                          "255",
+                          "1e300",
+                          "0.5",
+                          "65536",
+                          "4294967295",
+                          "18446744073709551615",
+                          "-9223372036854775808",
+                          "\"\"",
+                          "\"VEC4\"",
+                          "\"data:,\"",
+                          "[]",
+                          "[0]",
+                          "{}",
+                          "{\"a\": 1}"};
   size_t refused = 0, total = 0;
   for (auto it = flat.begin(); it != flat.end(); ++it) {
     // The leaf, and the object or array that holds it.
@@ -214,6 +238,26 @@ TEST(CheckGltf, SurvivesEveryValueReplaced) {
   EXPECT_LT(refused, total);
 }
 
+TEST(CheckGltf, SurvivesDamagedBuffers) {
+  Executor executor(1);
+  const TinyGltf good = FullGltf();
+  for (uint64_t i = 0; i < 2000; ++i) {
+    TinyGltf bad = good;
+    for (uint64_t k = 0; k < 4; ++k) {
+      const uint64_t r = HashKey(i, k);
+      bad.bin[r % bad.bin.size()] = static_cast<std::byte>(r >> 32);
+    }
+    const auto imported = bad.Import();
+    if (imported.ok()) {
+      const auto prepared = PreparedScene::Prepare(imported->scene, executor);
+      EXPECT_TRUE(prepared.ok() || prepared.status().code() == absl::StatusCode::kInvalidArgument)
+          << prepared.status();
+    } else {
+      EXPECT_EQ(imported.status().code(), absl::StatusCode::kInvalidArgument);
+    }
+  }
+}
+
 TEST(CheckGltf, SurvivesDamagedText) {
   Executor executor(1);
   const TinyGltf good = FullGltf();
@@ -226,10 +270,18 @@ TEST(CheckGltf, SurvivesDamagedText) {
       const uint64_t r = HashKey(i, k);
       const size_t at = r % damaged.size();
       switch (r >> 60 & 3) {
-        case 0: damaged[at] = static_cast<char>(r >> 32); break;
-        case 1: damaged.erase(at, 1 + (r >> 40) % 20); break;
-        case 2: damaged.insert(at, damaged.substr((r >> 24) % damaged.size(), (r >> 50) % 40)); break;
-        default: damaged[at] = static_cast<char>('0' + (r >> 32) % 10); break;
+        case 0:
+          damaged[at] = static_cast<char>(r >> 32);
+          break;
+        case 1:
+          damaged.erase(at, 1 + (r >> 40) % 20);
+          break;
+        case 2:
+          damaged.insert(at, damaged.substr((r >> 24) % damaged.size(), (r >> 50) % 40));
+          break;
+        default:
+          damaged[at] = static_cast<char>('0' + (r >> 32) % 10);
+          break;
       }
     }
     AssetBundle bad = asset;

@@ -1,10 +1,10 @@
 #include "core/scene/gltf_importer.h"
 
-#include <cmath>
-#include <limits>
-
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
 
 #include "tests/unit/core/scene/scene_test_util.h"
 
@@ -105,9 +105,13 @@ TEST(GltfImporter, ReadsStridesAndOffsets) {
   TinyGltf gltf = TriangleGltf();
   const auto view = gltf.View<float>({9, 0, 0, 5, 9, 1, 0, 5, 9, 0, 1, 5});
   gltf.json["bufferViews"][view]["byteStride"] = 16;
-  gltf.json["accessors"][0] = {{"bufferView", view}, {"byteOffset", 8}, {"componentType", 5126},
-                               {"count", 3}, {"type", "VEC3"}};
-  EXPECT_THAT(MessageOf(gltf), HasSubstr("/accessors/0"));  // the last element ends at byte 52 of 48
+  gltf.json["accessors"][0] = {{"bufferView", view},
+                               {"byteOffset", 8},
+                               {"componentType", 5126},
+                               {"count", 3},
+                               {"type", "VEC3"}};
+  EXPECT_THAT(MessageOf(gltf),
+              HasSubstr("/accessors/0"));  // the last element ends at byte 52 of 48
   gltf.json["accessors"][0]["byteOffset"] = 4;
   EXPECT_THAT(ImportOk(gltf).meshes[0].positions,
               ElementsAre(Vec3f(0, 0, 5), Vec3f(1, 0, 5), Vec3f(0, 1, 5)));
@@ -129,8 +133,8 @@ TEST(GltfImporter, ReadsNormalisedAndPlainIntegers) {
   attributes["NORMAL"] = normals;
   gltf.json["extensionsRequired"] = {"KHR_mesh_quantization"};
   const Mesh mesh = ImportOk(gltf).meshes[0];
-  EXPECT_THAT(mesh.positions, ElementsAre(Vec3f(-1, 0, 1), Vec3f(16384.0f / 32767, 0, 0),
-                                          Vec3f(0, -1, 0)));
+  EXPECT_THAT(mesh.positions,
+              ElementsAre(Vec3f(-1, 0, 1), Vec3f(16384.0f / 32767, 0, 0), Vec3f(0, -1, 0)));
   EXPECT_THAT(mesh.uv[0], ElementsAre(Vec2f{0, 1}, Vec2f{0.2f, 0}, Vec2f{0, 0.4f}));
   EXPECT_THAT(mesh.uv[1], ElementsAre(Vec2f{0, 1}, Vec2f{2, 3}, Vec2f{4, 65535}));
   EXPECT_THAT(mesh.normals, ElementsAre(Vec3f(0, 0, 1), Vec3f(0, 0, -1), Vec3f(1, 0, 0)));
@@ -159,9 +163,10 @@ TEST(GltfImporter, AppliesSparseValuesOverABaseAndOverNothing) {
 TEST(GltfImporter, MultipliesTransformsDownTheTreeInDouble) {
   TinyGltf gltf = TriangleGltf();
   const double h = std::sqrt(0.5);
-  gltf.json["nodes"] = {{{"translation", {1e6, 0, 0.1}}, {"children", {1, 2}}},
-                        {{"rotation", {0, 0, h, h}}, {"scale", {2, 3, 4}}, {"mesh", 0}},
-                        {{"matrix", {0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 5, 0, 6, 7, 8, 1}}, {"mesh", 0}}};
+  gltf.json["nodes"] = {
+      {{"translation", {1e6, 0, 0.1}}, {"children", {1, 2}}},
+      {{"rotation", {0, 0, h, h}}, {"scale", {2, 3, 4}}, {"mesh", 0}},
+      {{"matrix", {0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 5, 0, 6, 7, 8, 1}}, {"mesh", 0}}};
   const Scene scene = ImportOk(gltf);
   ASSERT_EQ(scene.instances.size(), 2u);
   // A quarter turn about z after scaling: x -> 2 y, y -> -3 x.
@@ -210,7 +215,8 @@ TEST(GltfImporter, WalksDeepHierarchiesWithoutRecursion) {
   TinyGltf gltf = TriangleGltf();
   Json nodes = Json::array();
   constexpr int kDepth = 20000;
-  for (int i = 0; i < kDepth; ++i) nodes.push_back({{"children", {i + 1}}, {"translation", {0, 0, 1}}});
+  for (int i = 0; i < kDepth; ++i)
+    nodes.push_back({{"children", {i + 1}}, {"translation", {0, 0, 1}}});
   nodes.push_back({{"mesh", 0}});
   gltf.json["nodes"] = nodes;
   const Scene scene = ImportOk(gltf);
@@ -258,7 +264,9 @@ TEST(GltfImporter, ReadsTexturesFromFilesDataAndBuffers) {
                          {{"uri", "data:image/png;base64," + Base64(png)}},
                          {{"bufferView", view}, {"mimeType", "image/png"}, {"name", "inner"}}};
   gltf.json["samplers"] = {{{"wrapS", 33071}, {"wrapT", 33648}, {"magFilter", 9728}}};
-  gltf.json["textures"] = {{{"source", 0}, {"sampler", 0}}, {{"source", 1}}, {{"source", 2}},
+  gltf.json["textures"] = {{{"source", 0}, {"sampler", 0}},
+                           {{"source", 1}},
+                           {{"source", 2}},
                            {{"source", 2}, {"sampler", 0}}};
   gltf.json["materials"] = Json::array();
   for (int t = 0; t < 4; ++t) {
@@ -350,8 +358,11 @@ TEST(GltfImporter, ReadsPerspectiveCamerasAndIgnoresTheirScale) {
       {{"type", "orthographic"},
        {"orthographic", {{"xmag", 1}, {"ymag", 1}, {"znear", 1}, {"zfar", 2}}}}};
   // Half a turn about y.
-  gltf.json["nodes"] = {{{"name", "cam"}, {"camera", 0}, {"translation", {1, 2, 3}},
-                         {"rotation", {0, 1, 0, 0}}, {"scale", {5, 7, 9}}},
+  gltf.json["nodes"] = {{{"name", "cam"},
+                         {"camera", 0},
+                         {"translation", {1, 2, 3}},
+                         {"rotation", {0, 1, 0, 0}},
+                         {"scale", {5, 7, 9}}},
                         {{"camera", 1}}};
   gltf.json["scenes"][0]["nodes"] = {0, 1};
   const Scene scene = ImportOk(gltf);
@@ -392,8 +403,8 @@ TEST(GltfImporter, RefusesBadValuesInBuffers) {
   Primitive(gltf)["indices"] = gltf.Accessor<uint16_t>({0, 1, 3}, 5123, "SCALAR", 1);
   EXPECT_THAT(MessageOf(gltf), AllOf(HasSubstr("scene.gltf: /meshes/0/primitives/0/indices"),
                                      HasSubstr("index 3 is beyond the 3 positions")));
-  for (const float bad : {std::numeric_limits<float>::quiet_NaN(),
-                          std::numeric_limits<float>::infinity()}) {
+  for (const float bad :
+       {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
     TinyGltf other = TriangleGltf();
     Primitive(other)["attributes"]["POSITION"] =
         other.Accessor<float>({0, 0, 0, 1, bad, 0, 0, 1, 0}, 5126, "VEC3", 3);
@@ -442,9 +453,8 @@ TEST(GltfImporter, ReadsBinaryContainers) {
     const auto value = static_cast<uint32_t>(v);
     return std::string(reinterpret_cast<const char*>(&value), 4);
   };
-  const std::string glb = "glTF" + u32(2) + u32(28 + json.size() + bin.size()) +
-                          u32(json.size()) + "JSON" + json + u32(bin.size()) +
-                          std::string("BIN\0", 4) + bin;
+  const std::string glb = "glTF" + u32(2) + u32(28 + json.size() + bin.size()) + u32(json.size()) +
+                          "JSON" + json + u32(bin.size()) + std::string("BIN\0", 4) + bin;
   const auto imported = ImportScene({"scene.glb", {{"scene.glb", Blob::FromString(glb)}}}, {});
   ASSERT_TRUE(imported.ok()) << imported.status();
   EXPECT_EQ(imported->scene.meshes.at(0).positions.size(), 3u);

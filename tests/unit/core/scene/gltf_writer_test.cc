@@ -1,10 +1,10 @@
 // WriteGltf (core/scene/procedural.h, gltf_writer.cc).
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
 #include <filesystem>
 #include <fstream>
 #include <sstream>
-
-#include <gmock/gmock.h>
-#include <gtest/gtest.h>
 
 #include "core/scene/importer.h"
 #include "core/scene/procedural.h"
@@ -18,8 +18,9 @@ using ::testing::HasSubstr;
 class GltfWriterTest : public ::testing::Test {
  protected:
   GltfWriterTest() {
-    folder_ = std::filesystem::path(::testing::TempDir()) /
-              ("writer_" + std::string(::testing::UnitTest::GetInstance()->current_test_info()->name()));
+    folder_ =
+        std::filesystem::path(::testing::TempDir()) /
+        ("writer_" + std::string(::testing::UnitTest::GetInstance()->current_test_info()->name()));
     std::filesystem::remove_all(folder_);
     std::filesystem::create_directories(folder_);
   }
@@ -213,7 +214,8 @@ TEST_F(GltfWriterTest, CommittedScenesAreUpToDate) {
     const auto made = ReadFile((folder_ / name).string());
     const auto kept = ReadFile((committed / name).string());
     ASSERT_TRUE(made.ok() && kept.ok()) << name << ": " << kept.status();
-    EXPECT_EQ(made->Hash().Hex(), kept->Hash().Hex()) << name << " differs from what the code makes";
+    EXPECT_EQ(made->Hash().Hex(), kept->Hash().Hex())
+        << name << " differs from what the code makes";
     EXPECT_LT(kept->size(), size_t{1} << 20);
   }
 }

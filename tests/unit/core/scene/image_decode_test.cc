@@ -23,7 +23,8 @@ TEST(DecodeImage, GivesThePixelsInRowsFromTheTopWithRedLowest) {
 }
 
 TEST(DecodeImage, RefusesWhatIsNoImageAndNamesIt) {
-  for (const std::string& bytes : {std::string(), std::string("not an image"), std::string(1, 'x')}) {
+  for (const std::string& bytes :
+       {std::string(), std::string("not an image"), std::string(1, 'x')}) {
     const auto image = Decode(bytes);
     ASSERT_FALSE(image.ok());
     EXPECT_EQ(image.status().code(), absl::StatusCode::kInvalidArgument);

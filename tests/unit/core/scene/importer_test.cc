@@ -1,13 +1,13 @@
 #include "core/scene/importer.h"
 
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <filesystem>
 #include <set>
-
-#include <gmock/gmock.h>
-#include <gtest/gtest.h>
 
 #include "core/base/executor.h"
 #include "core/scene/prepared_scene.h"

@@ -1,11 +1,11 @@
 #include "core/scene/prepared_scene.h"
 
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
 #include <bit>
 #include <cmath>
 #include <limits>
-
-#include <gmock/gmock.h>
-#include <gtest/gtest.h>
 
 #include "core/math/elementary.h"
 #include "core/math/sampling.h"
@@ -306,6 +306,24 @@ TEST(PreparedScene, DecodesOnlyTexturesThatAreSeen) {
   EXPECT_EQ(p->Surface(1, 0.1f, 0.1f).albedo, Rgb());
 }
 
+// Files of a hundred bytes that say they hold 2^27 texels each.
+TEST(PreparedScene, AddsUpTextureSizesBeforeDecoding) {
+  Scene scene = TriangleScene();
+  for (int i = 0; i < 9; ++i) {
+    Texture texture;
+    texture.name = "huge";
+    texture.encoded = Blob::FromString(MakePng(1, 1, {1, 2, 3, 4}, 16384, 8192));
+    scene.textures.push_back(texture);
+    Material material;
+    material.base_color_texture.texture = i;
+    scene.materials.push_back(material);
+    scene.meshes.push_back(scene.meshes[0]);
+    scene.meshes.back().material = i;
+    scene.instances.push_back({"huge", static_cast<uint32_t>(i + 1), {}});
+  }
+  EXPECT_THAT(MessageOf(scene), HasSubstr("1207959552 texels, more than 2^30"));
+}
+
 // The definition of a texture lookup, in double and without any cleverness.
 struct TextureOracle {
   int width, height;
@@ -358,12 +376,12 @@ TEST(PreparedScene, LooksTexturesUpAsTheirDefinitionSays) {
           scene.materials[0].alpha_cutoff = 2;
           scene.meshes[0].uv[0] = {{-2.3f, 3.1f}, {4.2f, -1.7f}, {0.4f, -3.3f}};
           const Prepared p = PrepareOk(scene);
-          const TextureOracle oracle{static_cast<int>(width), static_cast<int>(height), pixels,
-                                     wrap_s, wrap_t, nearest};
+          const TextureOracle oracle{
+              static_cast<int>(width), static_cast<int>(height), pixels, wrap_s, wrap_t, nearest};
           const auto& uv = scene.meshes[0].uv[0];
           for (int i = 0; i < 200; ++i) {
-            const Vec2f b = UniformTriangle(ToUnitFloat(HashKey(i, 1) >> 32),
-                                            ToUnitFloat(HashKey(i, 2) >> 32));
+            const Vec2f b =
+                UniformTriangle(ToUnitFloat(HashKey(i, 1) >> 32), ToUnitFloat(HashKey(i, 2) >> 32));
             const double b0 = 1.0 - b.x - b.y;
             const double u = b0 * uv[0].x + double{b.x} * uv[1].x + double{b.y} * uv[2].x;
             const double v = b0 * uv[0].y + double{b.x} * uv[1].y + double{b.y} * uv[2].y;
@@ -528,8 +546,9 @@ TEST(PreparedSceneBlob, RefusesTruncation) {
   const Blob city = PrepareOk(MakeCity(1, 1))->blob();
   for (size_t size = 0; size < city.size(); size += 97 * 53) {
     const auto bytes = city.bytes().subspan(0, size);
-    EXPECT_EQ(PreparedScene::FromBlob(Blob::FromVector({bytes.begin(), bytes.end()})).status().code(),
-              absl::StatusCode::kDataLoss);
+    EXPECT_EQ(
+        PreparedScene::FromBlob(Blob::FromVector({bytes.begin(), bytes.end()})).status().code(),
+        absl::StatusCode::kDataLoss);
   }
   const Blob small = PrepareOk(BlobScene())->blob();
   for (size_t size = 0; size < small.size(); ++size) {

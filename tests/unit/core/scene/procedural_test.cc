@@ -1,10 +1,10 @@
 #include "core/scene/procedural.h"
 
-#include <cmath>
-#include <map>
-
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+
+#include <cmath>
+#include <map>
 
 #include "core/base/executor.h"
 #include "core/math/elementary.h"
@@ -144,9 +144,12 @@ TEST(City, StandsOnTheGround) {
   const Scene scene = MakeCity(3, 1);
   std::map<std::pair<std::string, double>, double> lowest;
   for (const Instance& instance : scene.instances) {
-    double& low = lowest.try_emplace({instance.name, instance.world_from_mesh.translation.x +
-                                                         1e4 * instance.world_from_mesh.translation.z},
-                                     1e9).first->second;
+    double& low =
+        lowest
+            .try_emplace({instance.name, instance.world_from_mesh.translation.x +
+                                             1e4 * instance.world_from_mesh.translation.z},
+                         1e9)
+            .first->second;
     for (const Vec3f& p : scene.meshes[instance.mesh].positions) {
       low = std::min(low, instance.world_from_mesh.Point(Vec3d(p)).y);
     }

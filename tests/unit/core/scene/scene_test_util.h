@@ -1,12 +1,12 @@
 // Tiny glTF files and images for the tests of core/scene.
 #pragma once
 
+#include <gtest/gtest.h>
+
 #include <cstring>
+#include <nlohmann/json.hpp>
 #include <string>
 #include <vector>
-
-#include <gtest/gtest.h>
-#include <nlohmann/json.hpp>
 
 #include "core/base/blob.h"
 #include "core/scene/asset.h"
