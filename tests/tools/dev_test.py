@@ -160,10 +160,12 @@ class Dev(TreeTest):
     def test_bench_hands_its_arguments_on(self):
         code, _, _, calls = self.run_dev("bench", "micro", "--quick")
         self.assertEqual((0, "farpoint-bench micro --quick"), (code, calls[-1]))
+        self.assertTrue(calls[1].endswith(" --target farpoint-bench"), calls[1])
 
     def test_demo_renders_the_citys_image_with_two_workers(self):
         code, out, err, calls = self.run_dev("demo")
         self.assertEqual(0, code, err)
+        self.assertTrue(calls[1].endswith(" --target farpoint farpoint-server farpoint-worker"))
         self.assertEqual(2, sum(call.startswith("farpoint-worker --coordinator 127.0.0.1:4711 ")
                                 for call in calls))
         self.assertTrue(calls[-1].startswith(
