@@ -21,7 +21,9 @@ unsigned UsableCores() {
 }  // namespace
 
 struct Executor::Impl {
-  explicit Impl(unsigned threads) : arena(static_cast<int>(threads)) {}
+  // More threads than cores would only wait for each other, and oneTBB grants none (it says so on
+  // stderr).
+  explicit Impl(unsigned threads) : arena(static_cast<int>(std::min(threads, UsableCores()))) {}
   tbb::task_arena arena;
 };
 

@@ -12,7 +12,8 @@ namespace farpoint {
 
 class Executor {
  public:
-  // `threads` >= 1; 0 means all cores that this process may use.
+  // `threads` >= 1; 0 means all cores that this process may use. At most as many run as there are
+  // cores.
   explicit Executor(unsigned threads);
   ~Executor();
   Executor(const Executor&) = delete;

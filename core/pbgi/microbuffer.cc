@@ -293,7 +293,12 @@ Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f&
     sum_b = sum_b + w * b;
   }
   const float total = Sum8(sum_w);
-  if (!(total > 0.0f)) return Rgb();
+  if (!(total > 0.0f)) {
+    // A single pixel is the whole sphere and favours no direction: its mean radiance stands.
+    const float full = far.coverage()[0] > kFullFrom ? 1.0f / far.coverage()[0] : 1.0f;
+    const Rgb mean(far.radiance(0)[0], far.radiance(1)[0], far.radiance(2)[0]);
+    return mean * (kPif * full);
+  }
   const float scale = kPif / total;
   return {Sum8(sum_r) * scale, Sum8(sum_g) * scale, Sum8(sum_b) * scale};
 }

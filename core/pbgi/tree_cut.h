@@ -28,7 +28,7 @@ struct CutView {
   bool sees_inside = false;
 };
 
-inline constexpr float kCutPixels = 2.0f;
+inline constexpr float kCutPixels = 4.0f;
 
 // When to descend.
 struct CutParams {

@@ -11,7 +11,7 @@ namespace {
 
 constexpr uint32_t kDefaultMicrobuffer = 32;
 constexpr uint32_t kDefaultDegradedMicrobuffer = 16;
-constexpr uint32_t kDefaultClusters = 100;
+constexpr uint32_t kDefaultClusters = 64;
 
 constexpr std::array<std::string_view, 4> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt"};
 

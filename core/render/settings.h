@@ -28,7 +28,7 @@ struct RenderSettings {
   BufferMap buffer_map = BufferMap::kOctahedral;
   Splat splat = Splat::kCoverage;
   uint32_t clusters = 0;        // k per block, 1..1024; 0: the default
-  float epsilon = 0.1f;         // far: R_cluster < epsilon (d - r); >= 0
+  float epsilon = 0.2f;         // far: R_cluster < epsilon (d - r); >= 0
   float normal_weight = 1.0f;   // alpha / squared block diagonal (paper §3.1)
   uint32_t kmeans_iterations = 5;  // 0..100
   uint64_t seed = 0;

@@ -1,0 +1,164 @@
+// Renders against closed forms. The first oracle of all: no other renderer is trusted here.
+#include "tests/render/render_helpers.h"
+
+namespace farpoint {
+namespace {
+
+RenderSettings PathTracer(uint32_t paths) {
+  RenderSettings s;
+  s.integrator = Integrator::kPt;
+  s.paths = paths;
+  s.layers = {Layer::kIrradiance, Layer::kDirectIrradiance, Layer::kStdError, Layer::kBeauty};
+  return s;
+}
+
+// Mean over the image of a layer's first channel, and the standard error of that mean from the
+// pixels' own errors.
+struct Mean {
+  double value = 0, standard_error = 0;
+};
+Mean MeanOf(const Film& film) {
+  const auto e = film.Plane(Layer::kIrradiance, 0);
+  Mean m;
+  for (const float v : e) m.value += v;
+  m.value /= static_cast<double>(e.size());
+  if (film.Has(Layer::kStdError)) {
+    for (const float v : film.Plane(Layer::kStdError, 0)) {
+      m.standard_error += static_cast<double>(v) * static_cast<double>(v);
+    }
+    m.standard_error = std::sqrt(m.standard_error) / static_cast<double>(e.size());
+  }
+  return m;
+}
+
+// In a closed box that emits L everywhere one bounce gives E = pi rho L.
+TEST(Furnace, PathTracerAgreesWithinItsStandardError) {
+  const Scene scene = MakeFurnace(0.6f, 1.5f);
+  const Rendered r = RenderScene(scene, scene.cameras[0], Whole(32, 32), PathTracer(256));
+  const double expected = kPi * 0.6 * 1.5;
+  const Mean m = MeanOf(r.film);
+  EXPECT_GT(m.standard_error, 0.0);
+  EXPECT_NEAR(m.value, expected, 4 * m.standard_error);
+  EXPECT_NEAR(m.value, expected, 0.005 * expected);
+  // Direct: the whole hemisphere emits L.
+  for (const float e : r.film.Plane(Layer::kDirectIrradiance, 0)) {
+    EXPECT_NEAR(e, kPi * 1.5, 0.25 * kPi * 1.5);
+  }
+}
+
+TEST(Furnace, PointBasedIntegratorsAgreeWithinOnePercent) {
+  const Scene scene = MakeFurnace(0.6f, 1.5f);
+  const double expected = kPi * 0.6 * 1.5;
+  for (const Integrator integrator : {Integrator::kPbgi, Integrator::kFpbgi}) {
+    RenderSettings s;
+    s.integrator = integrator;
+    s.points = 60000;
+    s.layers = {Layer::kIrradiance};
+    const Rendered r = RenderScene(scene, scene.cameras[0], Whole(24, 24), s);
+    const Mean m = MeanOf(r.film);
+    EXPECT_NEAR(m.value, expected, 0.01 * expected) << NameOf(integrator);
+    for (const float e : r.film.Plane(Layer::kIrradiance, 0)) {
+      EXPECT_NEAR(e, expected, 0.06 * expected) << NameOf(integrator);
+    }
+  }
+}
+
+// A point light at the centre of a sphere of radius R and albedo rho: E_direct = I / R² and, as the
+// form factor between any two points of a sphere is the same, E_indirect = rho I / R².
+TEST(SphereWithLight, IndirectIsRhoTimesDirect) {
+  constexpr float kRadius = 2.0f, kRho = 0.5f, kIntensity = 12.0f;
+  Mesh sphere;
+  constexpr int kRings = 96, kSegments = 192;
+  for (int i = 0; i <= kRings; ++i) {
+    for (int j = 0; j < kSegments; ++j) {
+      const SinCos t = DetSinCos(kPi * i / kRings), p = DetSinCos(2 * kPi * j / kSegments);
+      sphere.positions.push_back(Vec3f(static_cast<float>(t.sin * p.cos),
+                                       static_cast<float>(t.cos),
+                                       static_cast<float>(t.sin * p.sin)) * kRadius);
+    }
+  }
+  const auto at = [&](int i, int j) {
+    return static_cast<uint32_t>(i * kSegments + j % kSegments);
+  };
+  for (int i = 0; i < kRings; ++i) {
+    for (int j = 0; j < kSegments; ++j) {
+      if (i > 0) sphere.triangles.push_back({at(i, j), at(i, j + 1), at(i + 1, j)});
+      if (i + 1 < kRings) sphere.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
+    }
+  }
+  Scene scene;
+  AddLambert(scene, sphere, kRho);
+  PunctualLight light;
+  light.intensity = Rgb(kIntensity, kIntensity, kIntensity);
+  scene.lights.push_back(light);
+  const Camera camera = LookAt({0.3, 0.1, 0.2}, {2, 0.5, 0.4}, {0, 1, 0}, 60);
+  const double direct = kIntensity / (kRadius * kRadius);
+
+  const Rendered pt = RenderScene(scene, camera, Whole(32, 32), PathTracer(256));
+  for (const float e : pt.film.Plane(Layer::kDirectIrradiance, 0)) {
+    EXPECT_NEAR(e, direct, 0.01 * direct);
+  }
+  const Mean m = MeanOf(pt.film);
+  // The polyhedron lies inside the sphere: up to 0.1 % nearer to the light.
+  EXPECT_NEAR(m.value, kRho * direct, 4 * m.standard_error + 0.002 * direct);
+
+  for (const Integrator integrator : {Integrator::kPbgi, Integrator::kFpbgi}) {
+    RenderSettings s;
+    s.integrator = integrator;
+    s.points = 60000;
+    s.layers = {Layer::kIrradiance};
+    const Rendered r = RenderScene(scene, camera, Whole(16, 16), s);
+    EXPECT_NEAR(MeanOf(r.film).value, kRho * direct, 0.015 * kRho * direct) << NameOf(integrator);
+  }
+}
+
+// A disc of radius a lit by the sun, over a small parallel receiver on its axis at distance h:
+// E = rho E_sun cos(theta) a² / (a² + h²).
+TEST(ParallelDiscs, HaveTheirFormFactor) {
+  constexpr float kA = 1.0f, kH = 1.5f, kRho = 0.7f, kSun = 3.0f;
+  Scene scene;
+  AddLambert(scene, DiscMesh({0, 0, 0}, kA, 512, +1), kRho);
+  AddLambert(scene, DiscMesh({0, 0, kH}, 0.01f, 32, -1), 0.5f);
+  PunctualLight sun;
+  sun.kind = PunctualKind::kDirectional;
+  sun.direction = Normalize(Vec3d(0.5, 0, -1));
+  sun.intensity = Rgb(kSun, kSun, kSun);
+  scene.lights.push_back(sun);
+  // From beside, a narrow view of the small disc's lower side.
+  const Camera camera = LookAt({0.5, 0, 0.5}, {0, 0, kH}, {0, 1, 0}, 0.2);
+  const double cosine = 1.0 / std::sqrt(1.25);
+  const double expected = kRho * kSun * cosine * kA * kA / (kA * kA + kH * kH);
+  const Rendered pt = RenderScene(scene, camera, Whole(8, 8), PathTracer(4096));
+  const Mean m = MeanOf(pt.film);
+  EXPECT_NEAR(m.value, expected, 4 * m.standard_error + 2e-3 * expected);
+  EXPECT_LT(m.standard_error, 0.01 * expected);
+  for (const Integrator integrator : {Integrator::kPbgi, Integrator::kFpbgi}) {
+    RenderSettings s;
+    s.integrator = integrator;
+    s.points = 20000;
+    s.layers = {Layer::kIrradiance};
+    const Rendered r = RenderScene(scene, camera, Whole(8, 8), s);
+    EXPECT_NEAR(MeanOf(r.film).value, expected, 0.04 * expected) << NameOf(integrator);
+  }
+}
+
+// Outside is nothing: a sky of radiance L over an open floor gives E_direct = pi L, and the floor
+// sees no other surface.
+TEST(Sky, IsDirectLightOnly) {
+  Scene scene;
+  AddLambert(scene, QuadMesh({-5, 0, 5}, {5, 0, 5}, {5, 0, -5}, {-5, 0, -5}), 0.8f);
+  scene.environment.sky = Rgb(2, 1, 0.5f);
+  RenderSettings s;
+  s.layers = {Layer::kDirectIrradiance, Layer::kIrradiance, Layer::kEmission, Layer::kBeauty};
+  s.points = 2000;
+  const Camera camera = LookAt({0, 2, 4}, {0, 0.5, 0}, {0, 1, 0}, 60);
+  const Rendered r = RenderScene(scene, camera, Whole(32, 32), s);
+  EXPECT_NEAR(r.film.Get(Layer::kDirectIrradiance, 0, 16, 28), 2 * kPi, 1e-4);
+  EXPECT_EQ(r.film.Get(Layer::kIrradiance, 0, 16, 28), 0.0f);
+  EXPECT_EQ(r.film.Get(Layer::kEmission, 0, 16, 0), 2.0f);  // the background
+  EXPECT_EQ(r.film.Get(Layer::kBeauty, 3, 16, 0), 0.0f);
+  EXPECT_EQ(r.film.Get(Layer::kBeauty, 3, 16, 28), 1.0f);
+}
+
+}  // namespace
+}  // namespace farpoint
