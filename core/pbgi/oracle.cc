@@ -137,7 +137,7 @@ Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const
     weights += w;
     sum += l * w;
   }
-  return weights > 0 ? Rgb(sum * (kPi / weights)) : Rgb();
+  return Rgb(sum * (kPi / weights));
 }
 
 }  // namespace farpoint

@@ -40,10 +40,14 @@ TEST(Furnace, PathTracerAgreesWithinItsStandardError) {
   EXPECT_GT(m.standard_error, 0.0);
   EXPECT_NEAR(m.value, expected, 4 * m.standard_error);
   EXPECT_NEAR(m.value, expected, 0.005 * expected);
-  // Direct: the whole hemisphere emits L.
+  // Direct: the whole hemisphere emits L. Twelve emitting triangles chosen by power are a hard case
+  // for 32 shadow rays: single pixels are off by up to a third, the mean is not.
+  double direct = 0;
   for (const float e : r.film.Plane(Layer::kDirectIrradiance, 0)) {
-    EXPECT_NEAR(e, kPi * 1.5, 0.25 * kPi * 1.5);
+    EXPECT_NEAR(e, kPi * 1.5, 0.4 * kPi * 1.5);
+    direct += e;
   }
+  EXPECT_NEAR(direct / 1024, kPi * 1.5, 0.01 * kPi * 1.5);
 }
 
 TEST(Furnace, PointBasedIntegratorsAgreeWithinOnePercent) {
