@@ -622,7 +622,11 @@ class CoordinatorImpl final : public Coordinator {
     auto next_save = std::chrono::steady_clock::now() + std::chrono::seconds(5);
     auto next_purge = std::chrono::steady_clock::now() + std::chrono::hours(1);
     std::unique_lock lock(mutex_);
+    TimePoint last = clock_->Now();
     while (!stopping_) {
+      const Duration gap = clock_->Now() - last;
+      last += gap;
+      if (gap > options_.silence_time / 2) scheduler_.Forgive(gap);
       const SchedulerNews news = scheduler_.Tick();
       HandleNews(news);
       const auto now = std::chrono::steady_clock::now();

@@ -483,6 +483,15 @@ SchedulerNews TileScheduler::ReportFailure(const WorkerId& worker, const LeaseId
   return news;
 }
 
+void TileScheduler::Forgive(Duration gap) {
+  const TimePoint now = clock_.Now();
+  for (auto& [id, live] : leases_) {
+    live.heard = std::min(now, live.heard + gap);
+    live.progressed = std::min(now, live.progressed + gap);
+  }
+  for (auto& [id, worker] : workers_) worker.heard = std::min(now, worker.heard + gap);
+}
+
 SchedulerNews TileScheduler::Tick() {
   SchedulerNews news;
   const TimePoint now = clock_.Now();

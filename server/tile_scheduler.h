@@ -121,6 +121,9 @@ class TileScheduler {
                               const absl::Status& error);
   std::optional<LeaseGrant> FindLease(const LeaseId& lease) const;
 
+  // The caller itself stood still for `gap` (its machine slept, its process was stopped) and could
+  // not hear anybody: that time counts against no lease and no worker.
+  void Forgive(Duration gap);
   // Finds what has run out by now. Call it every fraction of silence_time.
   SchedulerNews Tick();
 

@@ -114,6 +114,18 @@ TEST_F(TileSchedulerTest, SilentWorkerLosesItsLease) {
   EXPECT_TRUE(scheduler_.FinishCommit(again->lease, true));
 }
 
+TEST_F(TileSchedulerTest, TheCoordinatorsOwnSleepCountsAgainstNobody) {
+  AddJob("a", 1);
+  const WorkerId w = AddWorker("w");
+  ASSERT_TRUE(scheduler_.Lease(w).has_value());
+  clock_.Advance(std::chrono::hours(8));
+  scheduler_.Forgive(std::chrono::hours(8));
+  EXPECT_THAT(scheduler_.Tick().lost, IsEmpty());
+  EXPECT_TRUE(scheduler_.HasWorker(w));
+  clock_.Advance(options_.silence_time);
+  EXPECT_EQ(scheduler_.Tick().lost.size(), 1u);
+}
+
 TEST_F(TileSchedulerTest, OnlyProgressKeepsALeaseAlive) {
   AddJob("a", 1);
   const WorkerId w = AddWorker("w");
