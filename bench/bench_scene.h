@@ -1,0 +1,23 @@
+// Where a benchmark's scene comes from.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "core/base/status.h"
+#include "core/scene/scene.h"
+
+namespace farpoint {
+
+struct BenchScene {
+  Scene scene;
+  // What a user should know, one line each (core/scene/importer.h).
+  std::vector<std::string> notes;
+};
+
+// "cornell", "city" (four blocks by four, two by two if `small`) and "furnace" (reflectance 0.5,
+// radiance 1) are the project's own scenes and always the same; everything else is a glTF file. The
+// scene has a camera and a light. Errors are those of CollectAsset and ImportScene.
+absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small);
+
+}  // namespace farpoint

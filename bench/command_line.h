@@ -1,0 +1,28 @@
+// The command line of farpoint-bench. CLI11 is included in the .cc only.
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bench/micro.h"
+#include "bench/pareto.h"
+#include "core/base/status.h"
+
+namespace farpoint {
+
+enum class BenchVerb { kPareto, kMicro };
+
+struct BenchCommandLine {
+  std::optional<std::string> print;  // help or version: print it and do nothing else
+  BenchVerb verb = BenchVerb::kPareto;
+  std::string output_dir;
+  ParetoOptions pareto;
+  MicroOptions micro;  // json_path is left empty: it lies in output_dir
+};
+
+// `args` without the program's name. Errors are for a person, one line first: kInvalidArgument for
+// a wrong command line, kUnimplemented for the benchmarks that are planned but not built yet.
+absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> args);
+
+}  // namespace farpoint

@@ -1,0 +1,319 @@
+#include "bench/pareto_report.h"
+
+#include <algorithm>
+#include <array>
+#include <nlohmann/json.hpp>
+#include <span>
+#include <vector>
+
+#include "absl/strings/str_format.h"
+#include "bench/svg_plot.h"
+#include "bench/text.h"
+
+namespace farpoint {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+// By integrator; told apart in most kinds of colour blindness (Okabe and Ito).
+constexpr std::array kIntegrators = {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
+                                     Integrator::kPt};
+constexpr std::array kColors = {"#0072b2", "#e69f00", "#cc79a7", "#009e73"};
+
+Json ToJson(const Spread& s) { return {{"median", s.median}, {"min", s.min}, {"max", s.max}}; }
+
+template <typename T>
+Json OrNull(const std::optional<T>& value) {
+  return value ? Json(*value) : Json();
+}
+template <typename T>
+Json OrNull(bool present, const T& value) {
+  return present ? Json(value) : Json();
+}
+
+bool IsPreparation(int stage) { return stage < static_cast<int>(Stage::kPrimary); }
+
+Json ToJson(const PreparationTimes& times) {
+  Json json;
+  for (int i = 0; i < kStageCount; ++i) {
+    // A bake has no broadcast.
+    if (!IsPreparation(i) || i == static_cast<int>(Stage::kBroadcast)) continue;
+    json[kStageNames[static_cast<size_t>(i)]] = ToJson(times.stage[static_cast<size_t>(i)]);
+  }
+  json["total"] = ToJson(times.total);
+  return json;
+}
+
+Json ToJson(const ParetoPoint& p) {
+  Json seconds;
+  seconds["gather"] = ToJson(p.gather);
+  for (int i = 0; i < kStageCount; ++i) {
+    if (!IsPreparation(i)) {
+      seconds[kStageNames[static_cast<size_t>(i)]] = ToJson(p.stage[static_cast<size_t>(i)]);
+    }
+  }
+  return {
+      {"label", LabelOf(p)},
+      {"clusters", OrNull(p.clusters != 0, p.clusters)},
+      {"epsilon", OrNull(p.clusters != 0, p.epsilon)},
+      {"microbuffer", OrNull(p.microbuffer != 0, p.microbuffer)},
+      {"paths", OrNull(p.paths != 0, p.paths)},
+      {"seconds", seconds},
+      {"wall_seconds", ToJson(p.wall)},
+      {"us_per_receiver", p.us_per_receiver},
+      {"rr", p.rr},
+      {"rel_rmse", p.rel_rmse},
+      {"bias", p.bias},
+      {"reference_limited", p.reference_limited},
+      {"on_front", p.on_front},
+      {"pt_seconds_at_rr", OrNull(p.pt_seconds_at_rr)},
+      {"counts", p.counts},
+      {"hash", p.hash},
+  };
+}
+
+std::vector<const ParetoPoint*> ByTime(const ParetoReport& report, Integrator integrator) {
+  std::vector<const ParetoPoint*> points;
+  for (const ParetoPoint& p : report.points) {
+    if (p.integrator == integrator) points.push_back(&p);
+  }
+  std::stable_sort(points.begin(), points.end(), [](const ParetoPoint* a, const ParetoPoint* b) {
+    return a->gather.median < b->gather.median;
+  });
+  return points;
+}
+
+std::string ReferenceText(const ParetoReport& r) {
+  std::string text;
+  if (r.options.reference_path.empty()) {
+    text = absl::StrFormat("path tracer, %d paths per pixel, %.3g thread-seconds",
+                           r.options.reference_paths, r.reference_seconds);
+  } else {
+    text = r.options.reference_path;
+  }
+  if (r.reference_noise_known) {
+    return Concat({text, absl::StrFormat("; noise %.4f of its mean", r.reference_noise)});
+  }
+  return text + "; noise unknown, taken as 0: errors hold the reference's own";
+}
+
+std::string SceneText(const ParetoReport& r) {
+  return absl::StrFormat("%s, %d triangles, %d surfels, tree %.1f MB", r.options.scene, r.triangles,
+                         r.surfels, static_cast<double>(r.tree_bytes) * 1e-6);
+}
+
+std::string FilmText(const ParetoReport& r) {
+  return absl::StrFormat("%dx%d, %d receivers, %d pixels compared", r.options.width,
+                         r.options.height, r.receivers, r.compared_pixels);
+}
+
+std::string MachineText(const ParetoReport& r) {
+  return absl::StrFormat("%s, %d threads, load %.1f at the start and %.1f at the end", r.cpu,
+                         r.options.threads, r.load_average_start, r.load_average_end);
+}
+
+std::string SpreadText(const Spread& s) {
+  return absl::StrFormat("%.4g [%.4g, %.4g]", s.median, s.min, s.max);
+}
+
+std::string SpeedupText(const ParetoPoint& p) {
+  if (!p.pt_seconds_at_rr || !(p.gather.median > 0)) return "";
+  return absl::StrFormat("%.3g×", *p.pt_seconds_at_rr / p.gather.median);
+}
+
+std::string FlagsText(const ParetoPoint& p) {
+  std::string flags;
+  if (p.on_front) flags += "front";
+  if (p.reference_limited) Append(flags, {flags.empty() ? "" : ", ", "reference-limited"});
+  return flags;
+}
+
+LogLogPlot PlotOf(const ParetoReport& report) {
+  LogLogPlot plot;
+  plot.x_label = "gather, thread-seconds for the frame (median; bar: fastest to slowest repeat)";
+  plot.y_label = "error rr of irradiance";
+  for (size_t i = 0; i < kIntegrators.size(); ++i) {
+    PlotSeries series{std::string(NameOf(kIntegrators[i])), kColors[i], {}};
+    for (const ParetoPoint* p : ByTime(report, kIntegrators[i])) {
+      series.points.push_back({p->gather.median, p->rr, p->gather.min, p->gather.max,
+                               absl::StrFormat("%s %s: %s s, rr %.4f, bias %+.4f", series.name,
+                                               LabelOf(*p), SpreadText(p->gather), p->rr, p->bias),
+                               p->reference_limited, p->on_front});
+    }
+    plot.series.push_back(std::move(series));
+  }
+  if (report.reference_noise_known) plot.level = {report.reference_noise, "noise of the reference"};
+  return plot;
+}
+
+std::string Row(std::string_view tag, const std::vector<std::string>& cells) {
+  std::string row = "<tr>";
+  for (const std::string& cell : cells) {
+    Append(row, {"<", tag, ">", EscapeXml(cell), "</", tag, ">"});
+  }
+  return row + "</tr>\n";
+}
+
+constexpr std::string_view kStyle = R"(
+:root { color-scheme: light dark; }
+body { font: 15px/1.45 sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }
+svg { width: 100%; height: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 1rem 0; }
+.wide { overflow-x: auto; }
+th, td { text-align: right; padding: .2rem .7rem; border-bottom: 1px solid #8884;
+         white-space: nowrap; }
+th:first-child, td:first-child, td:nth-child(2), th:nth-child(2), td:last-child, th:last-child
+{ text-align: left; }
+dt { font-weight: bold; } dd { margin: 0 0 .4rem 0; }
+)";
+
+}  // namespace
+
+std::string ParetoJson(const ParetoReport& r) {
+  const ParetoOptions& o = r.options;
+  const bool from_file = !o.reference_path.empty();
+  const RenderSettings defaults;  // the defaults, which the points use
+  Json json = {
+      {"benchmark", "pareto"},
+      {"version", FARPOINT_VERSION},
+      {"date_utc", r.date_utc},
+      {"quick", o.quick},
+      {"machine",
+       {{"cpu", r.cpu},
+        {"threads", o.threads},
+        {"load_average", {{"start", r.load_average_start}, {"end", r.load_average_end}}}}},
+      {"scene",
+       {{"name", o.scene},
+        {"notes", r.notes},
+        {"triangles", r.triangles},
+        {"surfels", r.surfels},
+        {"nodes", r.nodes},
+        {"bytes", {{"scene", r.scene_bytes}, {"tree", r.tree_bytes}}},
+        {"hash", {{"scene", r.scene_hash}, {"tree", r.tree_hash}}}}},
+      {"film",
+       {{"width", o.width},
+        {"height", o.height},
+        {"spp", 1},
+        {"receivers", r.receivers},
+        {"compared_pixels", r.compared_pixels}}},
+      {"settings",
+       {{"seed", o.seed},
+        {"light_samples", o.light_samples},
+        {"repeat", o.repeat},
+        {"buffer_map", defaults.buffer_map == BufferMap::kOctahedral ? "octahedral" : "cosine"},
+        {"splat", defaults.splat == Splat::kCoverage ? "coverage" : "opaque"}}},
+      {"reference",
+       {{"kind", from_file ? "file" : "pt"},
+        {"file", OrNull(from_file, o.reference_path)},
+        {"layer", OrNull(!o.ref_layer.empty(), o.ref_layer)},
+        {"mask", OrNull(!o.mask_path.empty(), o.mask_path)},
+        {"paths", OrNull(!from_file, o.reference_paths)},
+        {"seconds", OrNull(!from_file, r.reference_seconds)},
+        {"mean", r.reference_mean},
+        {"noise", OrNull(r.reference_noise_known, r.reference_noise)}}},
+      {"preparation",
+       {{"point_based", ToJson(r.point_based)},
+        {"pt", ToJson(r.path_traced)},
+        {"load", ToJson(r.load)}}},
+  };
+  json["curves"] = Json::array();
+  for (const Integrator integrator : kIntegrators) {
+    Json points = Json::array();
+    for (const ParetoPoint* p : ByTime(r, integrator)) points.push_back(ToJson(*p));
+    json["curves"].push_back({{"integrator", NameOf(integrator)}, {"points", points}});
+  }
+  // A file name may be anything but UTF-8.
+  return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
+}
+
+std::string ParetoHtml(const ParetoReport& r) {
+  int left_out = 0;
+  const std::string svg = RenderSvg(PlotOf(r), &left_out);
+  std::string html =
+      Concat({"<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>\n"
+              "<meta name='viewport' content='width=device-width'>\n<title>Time against error: ",
+              EscapeXml(r.options.scene), "</title>\n<style>", kStyle, "</style></head><body>\n",
+              "<h1>Time against error: ", EscapeXml(r.options.scene), "</h1>\n<dl>\n"});
+  const auto item = [&](std::string_view term, std::string_view text) {
+    Append(html, {"<dt>", term, "</dt><dd>", EscapeXml(text), "</dd>\n"});
+  };
+  item("Scene", SceneText(r));
+  item("Film", FilmText(r));
+  item("Reference", ReferenceText(r));
+  item("Machine", MachineText(r));
+  item("Run", absl::StrFormat("farpoint %s, %s, median of %d%s", FARPOINT_VERSION, r.date_utc,
+                              r.options.repeat, r.options.quick ? ", quick" : ""));
+  for (const std::string& note : r.notes) item("Note", note);
+  Append(html, {"</dl>\n", svg,
+                "<p>Lower left is better: less time, less error. Lines join the points of an "
+                "integrator that none of its other points beats in both; points off the line are "
+                "faint. Rings: the reference's noise is more than half of the error."});
+  if (left_out > 0) {
+    Append(html, {" ", std::to_string(left_out),
+                  " points have an error or a time of zero and are in the table only."});
+  }
+  Append(html,
+         {"</p>\n<h2>Points</h2>\n<div class='wide'><table>\n",
+          Row("th", {"integrator", "setting", "gather, thread-s [min, max]", "µs/receiver", "rr",
+                     "rel. RMSE", "bias", "× pt at equal rr", "wall s [min, max]", "remarks"})});
+  for (const Integrator integrator : kIntegrators) {
+    for (const ParetoPoint* p : ByTime(r, integrator)) {
+      html +=
+          Row("td", {std::string(NameOf(integrator)), LabelOf(*p), SpreadText(p->gather),
+                     absl::StrFormat("%.3g", p->us_per_receiver), absl::StrFormat("%.4f", p->rr),
+                     absl::StrFormat("%.4f", p->rel_rmse), absl::StrFormat("%+.4f", p->bias),
+                     SpeedupText(*p), SpreadText(p->wall), FlagsText(*p)});
+    }
+  }
+  Append(html, {"</table></div>\n<h2>Preparation</h2>\n<p>Thread-seconds once per scene, "
+                "not in the times above: median [min, max].</p>\n<div class='wide'><table>\n",
+                Row("th", {"for", "import", "sample", "shade", "tree", "total"})});
+  const auto preparation = [&](const char* name, const PreparationTimes& times) {
+    std::vector<std::string> cells = {name};
+    for (const Stage s : {Stage::kImport, Stage::kSample, Stage::kShade, Stage::kTree}) {
+      cells.push_back(SpreadText(times.stage[static_cast<size_t>(s)]));
+    }
+    cells.push_back(SpreadText(times.total));
+    html += Row("td", cells);
+  };
+  preparation("fpbgi, pbgi, dpbgi", r.point_based);
+  preparation("pt", r.path_traced);
+  return Concat({html,
+                 "</table></div>\n<p>Loading (ray acceleration structure, light tables; "
+                 "everyone needs it): ",
+                 SpreadText(r.load), " thread-seconds.</p>\n", "</body></html>\n"});
+}
+
+std::string ParetoTable(const ParetoReport& r) {
+  std::string table =
+      Concat({"scene      ", SceneText(r), "\nfilm       ", FilmText(r), "\nreference  ",
+              ReferenceText(r), "\nmachine    ", MachineText(r), "\n\n"});
+  absl::StrAppendFormat(&table, "%-7s%-18s%33s%12s%9s%9s%9s%9s  %s\n", "", "setting",
+                        "gather s [min, max]", "us/receiver", "rr", "relRMSE", "bias", "x pt",
+                        "remarks");
+  for (const Integrator integrator : kIntegrators) {
+    for (const ParetoPoint* p : ByTime(r, integrator)) {
+      // Widths count bytes: the few signs beyond ASCII are written without them here.
+      std::string label;
+      if (integrator == Integrator::kFpbgi) {
+        label = absl::StrFormat("k=%d eps=%g %dpx", p->clusters, p->epsilon, p->microbuffer);
+      } else if (integrator == Integrator::kPt) {
+        label = LabelOf(*p);
+      } else {
+        label = absl::StrFormat("%dpx", p->microbuffer);
+      }
+      std::string speedup = SpeedupText(*p);
+      if (!speedup.empty()) speedup.replace(speedup.find("×"), std::string_view("×").size(), "x");
+      absl::StrAppendFormat(&table, "%-7s%-18s%33s%12.3g%9.4f%9.4f%+9.4f%9s  %s\n",
+                            NameOf(integrator), label, SpreadText(p->gather), p->us_per_receiver,
+                            p->rr, p->rel_rmse, p->bias, speedup, FlagsText(*p));
+    }
+  }
+  Append(table, {"\npreparation, thread-seconds once per scene: ", SpreadText(r.point_based.total),
+                 " (fpbgi, pbgi, dpbgi), ", SpreadText(r.path_traced.total), " (pt), loading ",
+                 SpreadText(r.load), "\n"});
+  return table;
+}
+
+}  // namespace farpoint

@@ -1,0 +1,82 @@
+#include "bench/program.h"
+
+#include <filesystem>
+#include <ostream>
+#include <span>
+#include <string_view>
+
+#include "bench/command_line.h"
+#include "bench/pareto_report.h"
+#include "core/base/blob.h"
+
+namespace farpoint {
+
+namespace {
+
+enum : int { kOk = 0, kUsage = 2, kPermanent = 42, kTryAgain = 75 };
+
+int ExitCode(const absl::Status& status) {
+  if (status.ok()) return kOk;
+  return absl::IsUnavailable(status) || absl::IsResourceExhausted(status) ? kTryAgain : kPermanent;
+}
+
+absl::Status WriteText(const std::filesystem::path& path, std::string_view text) {
+  return WriteFileAtomically(path.string(), std::as_bytes(std::span(text)));
+}
+
+absl::Status Pareto(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "pareto.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const ParetoReport report, RunPareto(line.pareto, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  for (const std::string& note : report.notes) err << "farpoint-bench: note: " << note << "\n";
+  FP_RETURN_IF_ERROR(WriteText(dir / "pareto.json", ParetoJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "pareto.html", ParetoHtml(report)));
+  out << ParetoTable(report) << "\n"
+      << (dir / "pareto.json").string() << "\n"
+      << (dir / "pareto.html").string() << "\n";
+  return absl::OkStatus();
+}
+
+absl::Status Micro(const BenchCommandLine& line, std::ostream& out) {
+  MicroOptions options = line.micro;
+  options.json_path = (std::filesystem::path(line.output_dir) / "micro.json").string();
+  FP_RETURN_IF_ERROR(RunMicro(options, out));
+  out << "\n" << options.json_path << "\n";
+  return absl::OkStatus();
+}
+
+absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  std::error_code error;
+  std::filesystem::create_directories(line.output_dir, error);
+  if (error) {
+    return absl::InvalidArgumentError(line.output_dir + ": cannot be made: " + error.message() +
+                                      "; name another folder with -o");
+  }
+  return line.verb == BenchVerb::kPareto ? Pareto(line, out, err) : Micro(line, out);
+}
+
+}  // namespace
+
+int RunBench(const std::vector<std::string>& args, std::ostream& out, std::ostream& err) {
+  const absl::StatusOr<BenchCommandLine> line = ParseBenchCommandLine(args);
+  if (!line.ok()) {
+    err << "farpoint-bench: " << line.status().message() << std::endl;
+    return kUsage;
+  }
+  if (line->print) {
+    out << *line->print << std::flush;
+    return kOk;
+  }
+  const absl::Status status = Run(*line, out, err);
+  if (!status.ok()) err << "farpoint-bench: " << status.message() << std::endl;
+  out.flush();
+  return ExitCode(status);
+}
+
+}  // namespace farpoint

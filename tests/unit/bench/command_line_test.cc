@@ -1,0 +1,125 @@
+#include "bench/command_line.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+namespace farpoint {
+namespace {
+
+using ::testing::HasSubstr;
+using ::testing::Not;
+
+std::string MessageOf(const std::vector<std::string>& args) {
+  const auto line = ParseBenchCommandLine(args);
+  return line.ok() ? "" : std::string(line.status().message());
+}
+
+TEST(BenchCommandLine, ParetoTakesAll) {
+  const auto line = ParseBenchCommandLine(
+      {"pareto", "--scene",     "city", "--resolution",    "320x200", "--reference",
+       "r.exr",  "--ref-layer", "x",    "--mask",          "m.npy",   "--noise",
+       "0.005",  "--points",    "1234", "--light-samples", "8",       "--seed",
+       "9",      "--repeat",    "5",    "--threads",       "1",       "--quick",
+       "-o",     "there"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  EXPECT_FALSE(line->print.has_value());
+  EXPECT_EQ(line->verb, BenchVerb::kPareto);
+  EXPECT_EQ(line->output_dir, "there");
+  const ParetoOptions& p = line->pareto;
+  EXPECT_EQ(p.scene, "city");
+  EXPECT_EQ(p.width, 320);
+  EXPECT_EQ(p.height, 200);
+  EXPECT_EQ(p.reference_path, "r.exr");
+  EXPECT_EQ(p.ref_layer, "x");
+  EXPECT_EQ(p.mask_path, "m.npy");
+  EXPECT_EQ(p.noise, 0.005);
+  EXPECT_EQ(p.points, 1234u);
+  EXPECT_EQ(p.light_samples, 8u);
+  EXPECT_EQ(p.seed, 9u);
+  EXPECT_EQ(p.repeat, 5u);
+  EXPECT_EQ(p.threads, 1u);
+  EXPECT_TRUE(p.quick);
+}
+
+TEST(BenchCommandLine, ParetoNeedsNothing) {
+  const auto line = ParseBenchCommandLine({"pareto"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  EXPECT_EQ(line->pareto.scene, "cornell");
+  EXPECT_EQ(line->pareto.width, 0);
+  EXPECT_FALSE(line->pareto.noise.has_value());
+  EXPECT_FALSE(line->pareto.quick);
+  EXPECT_EQ(line->output_dir, "out/bench");
+}
+
+TEST(BenchCommandLine, MicroTakesAll) {
+  const auto line = ParseBenchCommandLine({"micro", "--quick", "--filter", "sort$", "-o", "d"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  EXPECT_EQ(line->verb, BenchVerb::kMicro);
+  EXPECT_TRUE(line->micro.quick);
+  EXPECT_EQ(line->micro.filter, "sort$");
+  EXPECT_EQ(line->output_dir, "d");
+}
+
+TEST(BenchCommandLine, PlannedBenchmarksAreRefusedPlainly) {
+  for (const char* name : {"paper", "scale", "stability", "skip", "service"}) {
+    const auto line = ParseBenchCommandLine({name, "--quick"});
+    EXPECT_EQ(line.status().code(), absl::StatusCode::kUnimplemented) << name;
+    EXPECT_THAT(MessageOf({name}), HasSubstr("not built yet")) << name;
+  }
+}
+
+TEST(BenchCommandLine, HelpListsWhatWorksOnly) {
+  const auto line = ParseBenchCommandLine({"--help"});
+  ASSERT_TRUE(line.ok() && line->print.has_value());
+  EXPECT_THAT(*line->print, HasSubstr("  pareto "));
+  EXPECT_THAT(*line->print, HasSubstr("  micro "));
+  for (const char* name : {"  paper", "  scale", "  stability", "  skip", "  service"}) {
+    EXPECT_THAT(*line->print, Not(HasSubstr(name)));
+  }
+}
+
+TEST(BenchCommandLine, HelpOfAVerbListsItsFlags) {
+  const auto line = ParseBenchCommandLine({"pareto", "--help"});
+  ASSERT_TRUE(line.ok() && line->print.has_value());
+  for (const char* flag : {"--scene", "--resolution", "--reference", "--ref-layer", "--mask",
+                           "--noise", "--quick", "--repeat", "--output"}) {
+    EXPECT_THAT(*line->print, HasSubstr(flag));
+  }
+}
+
+TEST(BenchCommandLine, VersionIsPrinted) {
+  const auto line = ParseBenchCommandLine({"--version"});
+  ASSERT_TRUE(line.ok() && line->print.has_value());
+  EXPECT_EQ(*line->print, std::string("farpoint-bench ") + FARPOINT_VERSION + "\n");
+}
+
+TEST(BenchCommandLine, MistakesAreRefused) {
+  const std::vector<std::vector<std::string>> wrong = {
+      {},
+      {"fast"},
+      {"pareto", "micro"},
+      {"pareto", "--unknown"},
+      {"pareto", "--resolution", "64"},
+      {"pareto", "--resolution", "64x"},
+      {"pareto", "--resolution", "64x0"},
+      {"pareto", "--resolution", "-64x64"},
+      {"pareto", "--resolution", "64x64x64"},
+      {"pareto", "--repeat", "0"},
+      {"pareto", "--points", "0"},
+      {"pareto", "--noise", "0.1"},  // of which reference?
+      {"pareto", "--ref-layer", "E"},
+      {"pareto", "--reference", "r.exr", "--noise", "-1"},
+      {"pareto", "--reference", "r.exr", "--reference-paths", "64"},
+      {"pareto", "--reference-paths", "4"},  // too few for a standard error
+      {"micro", "--scene", "cornell"},
+      {"micro", "-o", ""},
+  };
+  for (const auto& args : wrong) {
+    const auto line = ParseBenchCommandLine(args);
+    EXPECT_EQ(line.status().code(), absl::StatusCode::kInvalidArgument)
+        << ::testing::PrintToString(args);
+  }
+}
+
+}  // namespace
+}  // namespace farpoint
