@@ -7,7 +7,7 @@
 add_library(farpoint_options INTERFACE)
 target_compile_options(farpoint_options INTERFACE
   -march=x86-64-v3 -ffp-contract=off -fno-math-errno -fno-trapping-math
-  -Wall -Wextra -Wno-unused-parameter -Wno-missing-field-initializers)
+  -Wall -Wextra -Wno-unused-parameter -Wno-missing-field-initializers -Wno-restrict)
 target_include_directories(farpoint_options INTERFACE ${PROJECT_SOURCE_DIR})
 target_compile_definitions(farpoint_options INTERFACE FARPOINT_VERSION="${PROJECT_VERSION}")
 if(FARPOINT_SANITIZE)

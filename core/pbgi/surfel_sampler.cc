@@ -14,6 +14,8 @@ constexpr int kCandidatesPerSurfel = 8;
 // Distance between surfels over sqrt(area / count): with eight candidates each, dart throwing at
 // this distance keeps about `count` of them (measured: within 2 % on planes).
 constexpr double kSpacingFactor = 0.759;
+// Edge of the cubes within which candidates are visited at random, in spacings.
+constexpr float kVisitCube = 16.0f;
 // Surfels compete only with those of the same side of a thin sheet.
 constexpr float kSameSurfaceCosine = 0.5f;
 
@@ -101,17 +103,37 @@ SurfelCloud SampleObject(const PreparedScene& scene, const PreparedObject& objec
   }
   if (candidates.empty()) return out;
 
-  // Visit in a random order: sort by hashed index.
-  std::vector<std::pair<uint32_t, uint32_t>> order(candidates.size());
+  // Visit in a random order, but one cube of kVisitCube spacings after the other, so that what is
+  // looked up lies in the cache. The cubes hang on the object, not on the world: they move with it.
+  const Vec3f anchor = candidates.front().position;
+  const float inverse_cube = 1.0f / (kVisitCube * spacing_m);
+  struct Visit {
+    uint64_t key;
+    uint32_t candidate;
+    bool operator<(const Visit& o) const {
+      return key != o.key ? key < o.key : candidate < o.candidate;
+    }
+  };
+  std::vector<Visit> order(candidates.size());
   for (uint32_t i = 0; i < order.size(); ++i) {
-    order[i] = {static_cast<uint32_t>(HashKey(key, i, 77)), i};
+    const Vec3f q = (candidates[i].position - anchor) * inverse_cube;
+    const uint64_t cube = HashKey(static_cast<uint64_t>(static_cast<int64_t>(std::floor(q.x))),
+                                  static_cast<uint64_t>(static_cast<int64_t>(std::floor(q.y))),
+                                  static_cast<uint64_t>(static_cast<int64_t>(std::floor(q.z))));
+    order[i] = {(cube & 0xffffffff00000000ull) | (HashKey(key, i, 77) >> 32), i};
   }
   std::sort(order.begin(), order.end());
+  {
+    std::vector<Candidate> sorted;
+    sorted.reserve(candidates.size());
+    for (const Visit& v : order) sorted.push_back(candidates[v.candidate]);
+    candidates.swap(sorted);
+  }
 
   Grid grid(candidates.size() / kCandidatesPerSurfel + 1, spacing_m);
   std::vector<uint32_t> accepted;
   const float spacing2 = spacing_m * spacing_m;
-  for (const auto& [unused, i] : order) {
+  for (uint32_t i = 0; i < candidates.size(); ++i) {
     const Candidate& c = candidates[i];
     const bool taken = grid.Any(c.position, [&](uint32_t a) {
       const Candidate& other = candidates[accepted[a]];
