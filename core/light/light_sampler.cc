@@ -46,9 +46,9 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
   }
   const Vec3d a = corner[0] / length[0], b = corner[1] / length[1], c = corner[2] / length[2];
   const double triple = std::fabs(Dot(a, Cross(b, c)));
-  const double solid_angle =
-      2.0 * DetAtan2(triple, 1.0 + Dot(a, b) + Dot(b, c) + Dot(c, a));
+  const double solid_angle = 2.0 * DetAtan2(triple, 1.0 + Dot(a, b) + Dot(b, c) + Dot(c, a));
   EmitterPoint out;
+  out.height_m = static_cast<float>(std::fabs(height));
   if (!(solid_angle > kSmallSolidAngle)) {
     const Vec2f bary = UniformTriangle(u, v);
     const Vec3d q = corner[0] + Vec3d(e.e1) * static_cast<double>(bary.x) +
@@ -76,10 +76,10 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
   const double uu = phi.cos - cos_alpha;
   const double vv = phi.sin + sin_alpha * cos_c;
   const double denominator = (vv * phi.sin + uu * phi.cos) * sin_alpha;
-  const double q = denominator != 0.0
-                       ? std::clamp(((vv * phi.cos - uu * phi.sin) * cos_alpha - vv) / denominator,
-                                    -1.0, 1.0)
-                       : 1.0;
+  const double q =
+      denominator != 0.0
+          ? std::clamp(((vv * phi.cos - uu * phi.sin) * cos_alpha - vv) / denominator, -1.0, 1.0)
+          : 1.0;
   const Vec3d toward_c = NormalizeOr(c - a * Dot(c, a), a);
   const Vec3d c_hat = a * q + toward_c * std::sqrt(std::max(0.0, 1.0 - q * q));
   const double z = 1.0 - static_cast<double>(v) * (1.0 - Dot(c_hat, b));
@@ -94,10 +94,8 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
   const double d11 = Dot(e1, e1), d12 = Dot(e1, e2), d22 = Dot(e2, e2);
   const double det = d11 * d22 - d12 * d12;
   if (!(det > 0.0)) return std::nullopt;
-  out.b1 = static_cast<float>(
-      std::clamp((Dot(at, e1) * d22 - Dot(at, e2) * d12) / det, 0.0, 1.0));
-  out.b2 = static_cast<float>(
-      std::clamp((Dot(at, e2) * d11 - Dot(at, e1) * d12) / det, 0.0, 1.0));
+  out.b1 = static_cast<float>(std::clamp((Dot(at, e1) * d22 - Dot(at, e2) * d12) / det, 0.0, 1.0));
+  out.b2 = static_cast<float>(std::clamp((Dot(at, e2) * d11 - Dot(at, e1) * d12) / det, 0.0, 1.0));
   out.direction = Vec3f(w);
   out.distance_m = static_cast<float>(distance);
   out.inverse_pdf_sr = static_cast<float>(solid_angle);
@@ -117,7 +115,7 @@ LightSampler::LightSampler(std::shared_ptr<const RayAccel> accel) : accel_(std::
     e.e2 = scene.vertices()[scene.triangles()[t].vertex[2]] - e.v0;
     e.normal = scene.GeometricNormal(t);
     e.area_m2 = scene.TriangleArea(t);
-    e.textured = material.emission_texture >= 0;
+    e.varies = material.emission_texture >= 0 || material.alpha_cutoff >= 0.0f;
     const double p = static_cast<double>(e.area_m2) * Luminance(material.emission);
     if (!(p > 0)) continue;
     total += p;
@@ -196,11 +194,19 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
         ++counters.skipped_facing_away;
         continue;
       }
-      const float reach_m = point->distance_m - 2.0f * accel_->surface_offset_m();
+      const PreparedMaterial& material = scene.MaterialOf(e.triangle);
+      Rgb radiance = material.emission;
+      if (e.varies) {
+        const SurfaceSample surface = scene.Surface(e.triangle, point->b1, point->b2);
+        if (surface.alpha < material.alpha_cutoff) continue;  // a hole of an alpha mask
+        radiance = surface.emission;
+      }
+      // Up to two surface offsets over the emitter's plane, not along the ray: a grazing ray would
+      // hit the emitter itself.
+      const float reach_m =
+          point->distance_m * (1.0f - 2.0f * accel_->surface_offset_m() / point->height_m);
       ++counters.rays;
       if (reach_m > 0.0f && accel_->Occluded(origin, point->direction, reach_m)) continue;
-      const Rgb radiance = e.textured ? scene.Surface(e.triangle, point->b1, point->b2).emission
-                                      : scene.MaterialOf(e.triangle).emission;
       sum += radiance * (cos_p * point->inverse_pdf_sr / e.probability);
     }
     irradiance += sum / static_cast<float>(samples);
@@ -211,8 +217,9 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
     const Frame frame(n);
     uint32_t open = 0;
     for (uint32_t i = 0; i < samples; ++i) {
-      const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(first_index + i, dimension, seed),
-                                                     OwenSobol(first_index + i, dimension + 1, seed)));
+      const Vec3f w =
+          frame.ToWorld(CosineHemisphere(OwenSobol(first_index + i, dimension, seed),
+                                         OwenSobol(first_index + i, dimension + 1, seed)));
       if (!(Dot(ng, w) > 0.0f)) continue;
       ++counters.rays;
       if (!accel_->Occluded(origin, w)) ++open;
