@@ -1,0 +1,213 @@
+#include "core/render/settings.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <functional>
+#include <limits>
+#include <string>
+#include <vector>
+
+namespace farpoint {
+namespace {
+
+using testing::HasSubstr;
+
+using Change = std::function<void(RenderSettings&)>;
+
+absl::Status Validated(const Change& change) {
+  RenderSettings s;
+  change(s);
+  return ValidateSettings(s);
+}
+
+// An invalid argument whose message has every one of `parts`.
+void ExpectRefused(const absl::Status& status, const std::vector<std::string>& parts) {
+  EXPECT_EQ(status.code(), absl::StatusCode::kInvalidArgument);
+  for (const std::string& part : parts) {
+    EXPECT_THAT(std::string(status.message()), HasSubstr(part));
+  }
+}
+
+TEST(RenderSettings, DefaultsAreValidForEveryIntegrator) {
+  for (const Integrator integrator :
+       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+    const absl::Status status = Validated([&](RenderSettings& s) { s.integrator = integrator; });
+    EXPECT_TRUE(status.ok()) << NameOf(integrator) << ": " << status;
+  }
+}
+
+struct Range {
+  const char* name;
+  uint64_t low, high;
+  std::function<void(RenderSettings&, uint64_t)> set;
+};
+
+TEST(RenderSettings, RangesHoldAtBothEnds) {
+  const auto u32 = [](uint64_t v) { return static_cast<uint32_t>(v); };
+  const Range ranges[] = {
+      {"spp", 1, 256, [&](RenderSettings& s, uint64_t v) { s.spp = u32(v); }},
+      {"paths", 1, 1u << 20, [&](RenderSettings& s, uint64_t v) { s.paths = u32(v); }},
+      {"light-samples", 1, 4096, [&](RenderSettings& s, uint64_t v) { s.light_samples = u32(v); }},
+      {"points", 0, uint64_t{1} << 31, [&](RenderSettings& s, uint64_t v) { s.points = v; }},
+      {"microbuffer", 0, 256, [&](RenderSettings& s, uint64_t v) { s.microbuffer = u32(v); }},
+      {"clusters", 0, 1024, [&](RenderSettings& s, uint64_t v) { s.clusters = u32(v); }},
+      {"kmeans-iterations", 0, 100,
+       [&](RenderSettings& s, uint64_t v) { s.kmeans_iterations = u32(v); }},
+  };
+  for (const Range& r : ranges) {
+    SCOPED_TRACE(r.name);
+    for (const uint64_t good : {r.low, r.low + 1, (r.low + r.high) / 2, r.high}) {
+      EXPECT_TRUE(Validated([&](RenderSettings& s) { r.set(s, good); }).ok()) << good;
+    }
+    std::vector<uint64_t> bad = {r.high + 1, std::numeric_limits<uint32_t>::max()};
+    if (r.low > 0) bad.push_back(r.low - 1);
+    for (const uint64_t value : bad) {
+      ExpectRefused(Validated([&](RenderSettings& s) { r.set(s, value); }),
+                    {std::string(r.name) + " is " + std::to_string(value),
+                     std::to_string(r.low) + " to " + std::to_string(r.high)});
+    }
+  }
+}
+
+TEST(RenderSettings, RealNumbersAreFiniteAndNotNegative) {
+  const float good[] = {0.0f, 1e-30f, 0.2f, 1e30f};
+  const float bad[] = {-1e-6f, std::numeric_limits<float>::infinity(),
+                       -std::numeric_limits<float>::infinity(),
+                       std::numeric_limits<float>::quiet_NaN()};
+  for (const float v : good) {
+    EXPECT_TRUE(Validated([&](RenderSettings& s) { s.epsilon = v; }).ok()) << v;
+    EXPECT_TRUE(Validated([&](RenderSettings& s) { s.normal_weight = v; }).ok()) << v;
+  }
+  for (const float v : bad) {
+    ExpectRefused(Validated([&](RenderSettings& s) { s.epsilon = v; }), {"epsilon"});
+    ExpectRefused(Validated([&](RenderSettings& s) { s.normal_weight = v; }), {"normal-weight"});
+  }
+}
+
+TEST(RenderSettings, TilesAreWholeBlocks) {
+  for (const uint32_t v : {32u, 64u, 96u, 128u, 65536u}) {
+    EXPECT_TRUE(Validated([&](RenderSettings& s) { s.tile_px = v; }).ok()) << v;
+  }
+  for (const uint32_t v : {0u, 1u, 31u, 33u, 100u, 65568u}) {
+    ExpectRefused(Validated([&](RenderSettings& s) { s.tile_px = v; }),
+                  {"tile is " + std::to_string(v), "multiple of 32"});
+  }
+}
+
+TEST(RenderSettings, UnknownEnumeratorsAreRefused) {
+  ExpectRefused(Validated([](RenderSettings& s) { s.integrator = static_cast<Integrator>(4); }),
+                {"integrator", "fpbgi, pbgi, dpbgi or pt"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.buffer_map = static_cast<BufferMap>(2); }),
+                {"buffer-map", "octahedral or cosine"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.splat = static_cast<Splat>(2); }),
+                {"splat", "coverage or opaque"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.layers = {static_cast<Layer>(kLayerCount)}; }),
+                {"aov", "unknown layer"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.layers.clear(); }), {"aov", "no layer"});
+}
+
+TEST(RenderSettings, AClusterCannotShareACosineBuffer) {
+  for (const Integrator integrator :
+       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+    const absl::Status status = Validated([&](RenderSettings& s) {
+      s.integrator = integrator;
+      s.buffer_map = BufferMap::kCosine;
+    });
+    if (integrator == Integrator::kFpbgi) {
+      ExpectRefused(status, {"buffer-map cosine", "octahedral"});
+    } else {
+      EXPECT_TRUE(status.ok()) << status;
+    }
+  }
+}
+
+TEST(RenderSettings, LayersBelongToTheirIntegrators) {
+  struct Case {
+    Layer layer;
+    Integrator integrator;
+    bool good;
+  };
+  std::vector<Case> cases;
+  for (const Integrator i :
+       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+    cases.push_back({Layer::kStdError, i, i == Integrator::kPt});
+    cases.push_back({Layer::kCluster, i, i == Integrator::kFpbgi});
+    cases.push_back({Layer::kCutSize, i, i != Integrator::kPt});
+    cases.push_back({Layer::kIrradiance, i, true});
+    cases.push_back({Layer::kDirectIrradiance, i, true});
+  }
+  for (const Case& c : cases) {
+    const absl::Status status = Validated([&](RenderSettings& s) {
+      s.integrator = c.integrator;
+      s.layers = {Layer::kBeauty, c.layer};
+    });
+    if (c.good) {
+      EXPECT_TRUE(status.ok()) << NameOf(c.integrator) << ": " << status;
+    } else {
+      ExpectRefused(status, {std::string(InfoOf(c.layer).name)});
+    }
+  }
+}
+
+TEST(RenderSettings, NamesAndIntegratorsMatch) {
+  const std::pair<const char*, Integrator> names[] = {{"fpbgi", Integrator::kFpbgi},
+                                                      {"pbgi", Integrator::kPbgi},
+                                                      {"dpbgi", Integrator::kDpbgi},
+                                                      {"pt", Integrator::kPt}};
+  for (const auto& [name, integrator] : names) {
+    EXPECT_EQ(NameOf(integrator), name);
+    const auto parsed = IntegratorFromName(name);
+    ASSERT_TRUE(parsed.ok()) << parsed.status();
+    EXPECT_EQ(*parsed, integrator);
+  }
+  for (const char* unknown : {"", "PT", "fpbgi ", "irr"}) {
+    ExpectRefused(IntegratorFromName(unknown).status(),
+                  {"'" + std::string(unknown) + "'", "fpbgi, pbgi, dpbgi or pt"});
+  }
+}
+
+TEST(RenderSettings, ZeroMeansTheDefaultInForce) {
+  RenderSettings s;
+  EXPECT_EQ(s.microbuffer_px(), 32u);
+  EXPECT_GE(s.clusters_per_block(), 1u);
+  // dpbgi is pbgi with a smaller buffer.
+  s.integrator = Integrator::kPbgi;
+  const uint32_t full = s.microbuffer_px();
+  s.integrator = Integrator::kDpbgi;
+  EXPECT_LT(s.microbuffer_px(), full);
+  // What is asked for is what is used.
+  s.microbuffer = 77;
+  s.clusters = 5;
+  EXPECT_EQ(s.microbuffer_px(), 77u);
+  EXPECT_EQ(s.clusters_per_block(), 5u);
+}
+
+TEST(RenderSettings, PaperPresetIsThePapers) {
+  RenderSettings s;
+  s.integrator = Integrator::kPbgi;
+  s.spp = 4;
+  s.seed = 9;
+  s.points = 1234;
+  s.buffer_map = BufferMap::kCosine;
+  ApplyPaperPreset(s);
+  EXPECT_EQ(s.clusters_per_block(), 100u);
+  EXPECT_EQ(s.epsilon, 0.1f);
+  EXPECT_EQ(s.splat, Splat::kOpaque);
+  EXPECT_EQ(s.normal_weight, 1.0f);
+  EXPECT_EQ(s.kmeans_iterations, 5u);
+  EXPECT_EQ(s.microbuffer_px(), 24u);
+  EXPECT_EQ(s.buffer_map, BufferMap::kOctahedral);
+  // It leaves alone what is the user's.
+  EXPECT_EQ(s.integrator, Integrator::kPbgi);
+  EXPECT_EQ(s.spp, 4u);
+  EXPECT_EQ(s.seed, 9u);
+  EXPECT_EQ(s.points, 1234u);
+  for (const Integrator i : {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi}) {
+    s.integrator = i;
+    EXPECT_TRUE(ValidateSettings(s).ok());
+  }
+}
+
+}  // namespace
+}  // namespace farpoint
