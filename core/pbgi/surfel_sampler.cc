@@ -83,6 +83,9 @@ SurfelCloud SampleObject(const PreparedScene& scene, const PreparedObject& objec
   // triangle are an Owen-scrambled Sobol' set.
   std::vector<Candidate> candidates;
   candidates.reserve(n);
+  const float alpha_cutoff = scene.materials()[object.material].alpha_cutoff;
+  const bool masked = alpha_cutoff >= 0.0f;
+  uint64_t drawn = 0;
   double below = 0;
   for (uint64_t j = 0; j < object.triangle_count; ++j) {
     const uint32_t t = static_cast<uint32_t>(object.first_triangle + j);
@@ -96,8 +99,11 @@ SurfelCloud SampleObject(const PreparedScene& scene, const PreparedObject& objec
     const Vec3f normal = scene.GeometricNormal(t);
     const uint32_t triangle_seed = static_cast<uint32_t>(HashKey(key, j));
     const uint32_t in_triangle = static_cast<uint32_t>(end - std::max(first, 0.0));
-    for (uint32_t k = 0; k < in_triangle && candidates.size() < n; ++k) {
+    for (uint32_t k = 0; k < in_triangle && drawn < n; ++k) {
       const Vec2f b = UniformTriangle(OwenSobol(k, 0, triangle_seed), OwenSobol(k, 1, triangle_seed));
+      ++drawn;
+      // A hole in an alpha mask is no surface.
+      if (masked && scene.Alpha(t, b.x, b.y) < alpha_cutoff) continue;
       candidates.push_back({scene.PointOn(t, b.x, b.y), normal, t, b});
     }
   }
@@ -163,7 +169,7 @@ SurfelCloud SampleObject(const PreparedScene& scene, const PreparedObject& objec
     ++share[owner];
   }
 
-  const double candidate_area = object_area_m2 / static_cast<double>(candidates.size());
+  const double candidate_area = object_area_m2 / static_cast<double>(drawn);
   for (size_t a = 0; a < accepted.size(); ++a) {
     if (share[a] == 0) continue;
     const Candidate& c = candidates[accepted[a]];
