@@ -248,8 +248,9 @@ constexpr auto kImage = "Image"sv, kCamera = "Camera"sv, kLights = "Lights and m
 
 constexpr RenderFlag kRenderFlags[] = {
     {"--preset", "NAME", kMethod,
-     "paper: every parameter as in the paper (32x32 blocks, 100 clusters, epsilon 0.1, opaque "
-     "splats, 5 iterations, 24x24 buffers); other flags override it",
+     "paper: the paper's parameters (32x32 blocks, 100 clusters, epsilon 0.1, opaque splats, "
+     "5 iterations, 24x24 buffers; docs/paper-map.md lists what differs all the same); other flags "
+     "override it",
      [](std::string_view value, JobEdit& edit) {
        bool paper = false;
        FP_RETURN_IF_ERROR(ParseChoice(value, {Choice<bool>{"paper", true}}, paper));
@@ -283,7 +284,7 @@ constexpr RenderFlag kRenderFlags[] = {
        return ParseCount(value, edit.spec.settings.paths);
      }},
     {"--light-samples", "N", kMethod,
-     "shadow rays per receiver or surfel and light, 1..4096; default 16",
+     "shadow rays per receiver or surfel and light, 1..4096; default 32",
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.light_samples);
      }},
@@ -312,8 +313,8 @@ constexpr RenderFlag kRenderFlags[] = {
                           {Choice<Splat>{"coverage", Splat::kCoverage}, {"opaque", Splat::kOpaque}},
                           edit.spec.settings.splat);
      }},
-    {"--clusters", "N", kMethod, "fpbgi: clusters per block, 1..1024", ApplyClusters},
-    {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.1",
+    {"--clusters", "N", kMethod, "fpbgi: clusters per block, 1..1024; default 64", ApplyClusters},
+    {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.2",
      [](std::string_view value, JobEdit& edit) {
        double epsilon = 0;
        if (!ParseFinite(value, epsilon) || epsilon < 0 ||

@@ -1,6 +1,6 @@
 // What this machine's arithmetic makes of a small fixed picture. Two workers with one fingerprint
-// give one image the same bits (DESIGN: determinism); a processor whose reciprocals differ, or
-// another version, has another fingerprint.
+// give one image the same bits (docs/decisions/0001-determinism.md); a processor whose reciprocals
+// differ, or another version, has another fingerprint.
 #pragma once
 
 #include "core/base/executor.h"

@@ -47,9 +47,7 @@ class RayAccel {
   // Where a ray leaves a surface at `p` on the side of the unit geometric normal `ng`: p moved by
   // 2^-19 of the scene's diagonal, about eight times the rounding error of a position, so that the
   // ray does not hit the surface that it leaves. Proportional to the scene: no absolute length.
-  Vec3f LeaveSurface(const Vec3f& p, const Vec3f& ng) const {
-    return p + ng * surface_offset_m_;
-  }
+  Vec3f LeaveSurface(const Vec3f& p, const Vec3f& ng) const { return p + ng * surface_offset_m_; }
   float surface_offset_m() const { return surface_offset_m_; }
 
  private:

@@ -25,7 +25,7 @@ static_assert(std::endian::native == std::endian::little, "byte formats are litt
 class ByteWriter {
  public:
   template <typename T>
-    requires std::is_trivially_copyable_v<T>
+  requires std::is_trivially_copyable_v<T>
   void Put(const T& value) {
     const size_t at = bytes_.size();
     bytes_.resize(at + sizeof(T));
@@ -39,7 +39,7 @@ class ByteWriter {
   }
   // u64 count, zero bytes up to a multiple of kBlobAlignment, then the elements.
   template <typename T>
-    requires std::is_trivially_copyable_v<T>
+  requires std::is_trivially_copyable_v<T>
   void PutArray(std::span<const T> values) {
     Put<uint64_t>(values.size());
     bytes_.resize((bytes_.size() + kBlobAlignment - 1) / kBlobAlignment * kBlobAlignment);
@@ -64,8 +64,7 @@ class ByteReader {
   explicit ByteReader(std::span<const std::byte> bytes) : bytes_(bytes) {}
 
   template <typename T>
-    requires std::is_trivially_copyable_v<T>
-  absl::Status Get(T& value, std::string_view field) {
+  requires std::is_trivially_copyable_v<T> absl::Status Get(T& value, std::string_view field) {
     if (bytes_.size() - at_ < sizeof(T)) return Short(field);
     std::memcpy(&value, bytes_.data() + at_, sizeof(T));
     at_ += sizeof(T);
@@ -82,8 +81,8 @@ class ByteReader {
   // The view points into the blob. The bytes must start at a multiple of
   // kBlobAlignment (a Blob does); kDataLoss otherwise if T asks for more than 16.
   template <typename T>
-    requires std::is_trivially_copyable_v<T>
-  absl::Status GetArray(std::span<const T>& values, std::string_view field) {
+  requires std::is_trivially_copyable_v<T> absl::Status GetArray(std::span<const T>& values,
+                                                                 std::string_view field) {
     uint64_t count = 0;
     FP_RETURN_IF_ERROR(Get(count, field));
     const size_t aligned = (at_ + kBlobAlignment - 1) / kBlobAlignment * kBlobAlignment;
@@ -106,9 +105,9 @@ class ByteReader {
 
  private:
   absl::Status Short(std::string_view field) const {
-    return absl::DataLossError("field '" + std::string(field) + "' at byte " +
-                               std::to_string(at_) + " does not fit into the " +
-                               std::to_string(bytes_.size()) + " bytes of the record");
+    return absl::DataLossError("field '" + std::string(field) + "' at byte " + std::to_string(at_) +
+                               " does not fit into the " + std::to_string(bytes_.size()) +
+                               " bytes of the record");
   }
   std::span<const std::byte> bytes_;
   size_t at_ = 0;

@@ -9,13 +9,24 @@
 namespace farpoint {
 
 enum class Stage {
-  kImport, kSample, kShade, kTree, kBroadcast, kPrimary, kDirect, kCluster,
-  kCut, kRaster, kComposite, kConvolve, kTrace,
+  kImport,
+  kSample,
+  kShade,
+  kTree,
+  kBroadcast,
+  kPrimary,
+  kDirect,
+  kCluster,
+  kCut,
+  kRaster,
+  kComposite,
+  kConvolve,
+  kTrace,
 };
 inline constexpr int kStageCount = 13;
 inline constexpr std::array<const char*, kStageCount> kStageNames = {
-    "import", "sample", "shade", "tree", "broadcast", "primary", "direct", "cluster",
-    "cut", "raster", "composite", "convolve", "trace"};
+    "import",  "sample", "shade",  "tree",      "broadcast", "primary", "direct",
+    "cluster", "cut",    "raster", "composite", "convolve",  "trace"};
 
 // Plain sums: merge with +=. Not thread-safe; each block has its own, merged in block order.
 struct Stats {

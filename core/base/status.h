@@ -32,10 +32,10 @@ inline absl::Status Annotate(const absl::Status& status, std::string_view contex
 #define FP_CONCAT_(a, b) FP_CONCAT_INNER_(a, b)
 
 // Returns the status of `expr` from the enclosing function unless it is OK.
-#define FP_RETURN_IF_ERROR(expr)                  \
-  do {                                            \
-    absl::Status fp_status_ = (expr);             \
-    if (!fp_status_.ok()) return fp_status_;      \
+#define FP_RETURN_IF_ERROR(expr)             \
+  do {                                       \
+    absl::Status fp_status_ = (expr);        \
+    if (!fp_status_.ok()) return fp_status_; \
   } while (0)
 
 // FP_ASSIGN_OR_RETURN(auto x, F()): x from an absl::StatusOr, or return its status.

@@ -53,7 +53,7 @@ std::vector<std::byte> EncodeFilm(const Film& film);
 // Sizes are checked before allocation.
 absl::StatusOr<Film> DecodeFilm(std::span<const std::byte> bytes);
 
-// DESIGN §4. The hash of a block of a layer is SHA-256 over its stored values; a film's layer hash
+// The hash of a block of a layer is SHA-256 over its stored values; a film's layer hash
 // combines its blocks' hashes in raster order; its image hash combines all layers'. Blocks are
 // those of the frame's grid clipped to `film.rect()`, so neither tile size nor order enters.
 // The film must have been rounded to storage.

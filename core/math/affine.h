@@ -12,9 +12,7 @@ struct Affine {
 
   bool operator==(const Affine&) const = default;
   Vec3d Point(const Vec3d& p) const { return Vector(p) + translation; }
-  Vec3d Vector(const Vec3d& v) const {
-    return column[0] * v.x + column[1] * v.y + column[2] * v.z;
-  }
+  Vec3d Vector(const Vec3d& v) const { return column[0] * v.x + column[1] * v.y + column[2] * v.z; }
   // Normals go by the inverse transpose; up to a positive factor that is the cofactor matrix,
   // which exists for singular transforms too. Mirrored transforms keep the side of the face.
   // Not normalised.

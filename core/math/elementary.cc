@@ -58,10 +58,14 @@ SinCos DetSinCos(double angle_rad) {
   const double s = SinSeries(r);
   const double c = CosSeries(r);
   switch (static_cast<int64_t>(q) & 3) {
-    case 0: return {s, c};
-    case 1: return {c, -s};
-    case 2: return {-s, -c};
-    default: return {-c, s};
+    case 0:
+      return {s, c};
+    case 1:
+      return {c, -s};
+    case 2:
+      return {-s, -c};
+    default:
+      return {-c, s};
   }
 }
 

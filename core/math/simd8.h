@@ -14,12 +14,9 @@ using M8 = int32_t __attribute__((vector_size(32)));  // lane mask: 0 or -1
 inline F8 Load8(const float* p) { return reinterpret_cast<F8>(_mm256_load_ps(p)); }  // 32-aligned
 inline void Store8(float* p, F8 v) { _mm256_store_ps(p, reinterpret_cast<__m256>(v)); }
 inline F8 Set8(float s) { return reinterpret_cast<F8>(_mm256_set1_ps(s)); }
-inline F8 Sqrt8(F8 v) {
-  return reinterpret_cast<F8>(_mm256_sqrt_ps(reinterpret_cast<__m256>(v)));
-}
+inline F8 Sqrt8(F8 v) { return reinterpret_cast<F8>(_mm256_sqrt_ps(reinterpret_cast<__m256>(v))); }
 inline F8 Abs8(F8 v) {
-  return reinterpret_cast<F8>(
-      _mm256_andnot_ps(_mm256_set1_ps(-0.0f), reinterpret_cast<__m256>(v)));
+  return reinterpret_cast<F8>(_mm256_andnot_ps(_mm256_set1_ps(-0.0f), reinterpret_cast<__m256>(v)));
 }
 // b where a is NaN
 inline F8 Max8(F8 a, F8 b) {
@@ -31,9 +28,8 @@ inline F8 Min8(F8 a, F8 b) {
       _mm256_min_ps(reinterpret_cast<__m256>(a), reinterpret_cast<__m256>(b)));
 }
 inline F8 Select8(M8 mask, F8 yes, F8 no) {
-  return reinterpret_cast<F8>(_mm256_blendv_ps(reinterpret_cast<__m256>(no),
-                                               reinterpret_cast<__m256>(yes),
-                                               reinterpret_cast<__m256>(mask)));
+  return reinterpret_cast<F8>(_mm256_blendv_ps(
+      reinterpret_cast<__m256>(no), reinterpret_cast<__m256>(yes), reinterpret_cast<__m256>(mask)));
 }
 // Bit k is lane k's mask.
 inline unsigned Bits8(M8 mask) {

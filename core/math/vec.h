@@ -138,7 +138,9 @@ struct Frame {
     t = {1.0f + sign * n.x * n.x * a, sign * c, -sign * n.x};
     b = {c, sign + n.y * n.y * a, -n.y};
   }
-  Vec3f ToWorld(const Vec3f& v_local) const { return t * v_local.x + b * v_local.y + n * v_local.z; }
+  Vec3f ToWorld(const Vec3f& v_local) const {
+    return t * v_local.x + b * v_local.y + n * v_local.z;
+  }
 };
 
 }  // namespace farpoint

@@ -33,9 +33,14 @@ class Rasterizer {
  public:
   Rasterizer(const PointTree& tree, const CutView& view, Splat splat, Microbuffer& buffer,
              RasterCounters& counters)
-      : tree_(tree), map_(buffer.map()), buffer_(buffer), counters_(counters),
+      : tree_(tree),
+        map_(buffer.map()),
+        buffer_(buffer),
+        counters_(counters),
         frame_(view.normal),
-        splat_(splat), local_(map_.kind() == BufferMap::kCosine), side_(map_.side()) {}
+        splat_(splat),
+        local_(map_.kind() == BufferMap::kCosine),
+        side_(map_.side()) {}
 
   void Draw(const CutNode& node, bool leaf) {
     const float omega = std::fabs(node.signed_solid_angle);
@@ -43,8 +48,7 @@ class Rasterizer {
     const Vec3f w = local_ ? ToLocal(node.direction) : node.direction;
     // Compared with the pixel under the centre; a node on the cosine map's horizon uses the lowest.
     const bool below = local_ && w.z < 0.0f;
-    const Vec2f at =
-        map_.Project(below ? NormalizeOr(Vec3f(w.x, w.y, 0), Vec3f(1, 0, 0)) : w);
+    const Vec2f at = map_.Project(below ? NormalizeOr(Vec3f(w.x, w.y, 0), Vec3f(1, 0, 0)) : w);
     const int last = static_cast<int>(side_) - 1;
     const int i = std::min(static_cast<int>(at.x), last);
     const int j = std::min(static_cast<int>(at.y), last);
@@ -76,8 +80,7 @@ class Rasterizer {
 
   // What the node reflects to the side from which it is seen.
   const Rgb& Radiance(const CutNode& node) const {
-    const RadianceGroup::Sides& sides =
-        tree_.radiance(node.slot / kLanes).lane[node.slot % kLanes];
+    const RadianceGroup::Sides& sides = tree_.radiance(node.slot / kLanes).lane[node.slot % kLanes];
     return node.signed_solid_angle > 0.0f ? sides.front : sides.back;
   }
 

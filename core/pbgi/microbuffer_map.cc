@@ -55,12 +55,11 @@ Vec2f SquareFromDisc(float x, float y) {
   const double four_over_pi = 4.0 / kPi;
   if (std::fabs(x) > std::fabs(y)) {
     const float s = std::copysign(r, x);
-    return {s, s * static_cast<float>(four_over_pi * DetAtan2(y * std::copysign(1.0f, x),
-                                                              std::fabs(x)))};
+    return {s, s * static_cast<float>(four_over_pi *
+                                      DetAtan2(y * std::copysign(1.0f, x), std::fabs(x)))};
   }
   const float s = std::copysign(r, y);
-  return {s * static_cast<float>(four_over_pi *
-                                 DetAtan2(x * std::copysign(1.0f, y), std::fabs(y))),
+  return {s * static_cast<float>(four_over_pi * DetAtan2(x * std::copysign(1.0f, y), std::fabs(y))),
           s};
 }
 

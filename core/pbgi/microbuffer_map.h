@@ -2,7 +2,7 @@
 // hemisphere). A map is a table, computed once per buffer size and shared.
 //
 //   kOctahedral  the whole sphere, world-aligned: one map for every receiver of a cluster,
-//                whatever its normal (DESIGN §3: a hemisphere about the active receiver's normal
+//                whatever its normal (a hemisphere about the active receiver's normal
 //                would miss what others see).
 //   kCosine      the hemisphere about a receiver's normal (local frame, z up), each pixel with the
 //                same cosine-weighted solid angle pi / N².
@@ -37,7 +37,7 @@ class MicrobufferMap {
 
   // Unit directions of the pixels' centres (in the map's frame).
   const float* dir(int axis) const { return dir_[axis].data(); }
-  const float* solid_angle() const { return solid_angle_.data(); }  // sr
+  const float* solid_angle() const { return solid_angle_.data(); }      // sr
   const float* weight(int axis) const { return weight_[axis].data(); }  // V
 
   // Where a unit direction falls, in pixels: u, v in [0, side]. For kCosine the direction must

@@ -19,8 +19,13 @@ struct LiteralNode {
 LiteralNode ReadNode(const PointTree& tree, uint32_t slot) {
   const NodeGroup& g = tree.group(slot / kLanes);
   const uint32_t k = slot % kLanes;
-  return {{g.cx[k], g.cy[k], g.cz[k]}, {g.nx[k], g.ny[k], g.nz[k]}, g.radius[k], g.thickness[k],
-          g.sin_cone[k], g.front_area[k], g.back_area[k]};
+  return {{g.cx[k], g.cy[k], g.cz[k]},
+          {g.nx[k], g.ny[k], g.nz[k]},
+          g.radius[k],
+          g.thickness[k],
+          g.sin_cone[k],
+          g.front_area[k],
+          g.back_area[k]};
 }
 
 bool BelowEveryHorizon(const LiteralNode& n, const CutView& view) {
@@ -92,7 +97,8 @@ void Visit(const PointTree& tree, const CutView& view, const CutParams& params, 
   if (params.map == BufferMap::kCosine) {
     pixel_sr /= std::max(0.1, Dot(Vec3d(view.normal), v) / d);
   }
-  const bool fine = kPi * n.radius * n.radius <= kCutPixels * pixel_sr * d * d && Length2(n.mean) >= 0.5;
+  const bool fine =
+      kPi * n.radius * n.radius <= kCutPixels * pixel_sr * d * d && Length2(n.mean) >= 0.5;
   if (fine) {
     far.push_back(MakeNode(n, view, slot, v, d));
     return;

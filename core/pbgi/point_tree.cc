@@ -20,8 +20,8 @@ constexpr int kHilbertBits = 16;
 
 // What building needs of a node beyond what is stored.
 struct BuildNode {
-  Box3f centres;      // of all surfels below
-  float max_radius;   // of all surfels below
+  Box3f centres;     // of all surfels below
+  float max_radius;  // of all surfels below
   double area, front_area, back_area;
   Vec3d area_normal;  // Σ A n
   Vec3d area_centre;  // Σ A c
@@ -66,8 +66,7 @@ void MakeParent(const NodeGroup& g, const BuildNode* children, uint32_t count, N
     const Vec3f child_unit = NormalizeOr(child_mean, Vec3f(0, 0, 1));
     const float c = std::min(1.0f, std::fabs(Dot(child_unit, unit)));
     const float tilt = std::sqrt(std::max(0.0f, 1.0f - c * c));
-    const float reach =
-        std::min(g.radius[k], g.radius[k] * tilt + g.thickness[k] * c);
+    const float reach = std::min(g.radius[k], g.radius[k] * tilt + g.thickness[k] * c);
     thickness = std::max(thickness, std::fabs(Dot(offset, unit)) + reach);
     // cos(a + b) for the angle a between the normals and the child's own cone b.
     const float cos_a = std::clamp(Dot(child_unit, unit), -1.0f, 1.0f);
@@ -89,8 +88,9 @@ void MakeParent(const NodeGroup& g, const BuildNode* children, uint32_t count, N
   out.ny[lane] = mean.y;
   out.nz[lane] = mean.z;
   out.sin_cone[lane] =
-      cos_cone <= 0.0f ? 1.0f
-                       : std::min(1.0f, std::sqrt(std::max(0.0f, 1.0f - cos_cone * cos_cone)) + 1e-6f);
+      cos_cone <= 0.0f
+          ? 1.0f
+          : std::min(1.0f, std::sqrt(std::max(0.0f, 1.0f - cos_cone * cos_cone)) + 1e-6f);
   out.area[lane] = static_cast<float>(info.area);
   out.front_area[lane] = static_cast<float>(info.front_area);
   out.back_area[lane] = static_cast<float>(info.back_area);
@@ -178,9 +178,7 @@ PointTree::Blobs PointTree::Build(const SurfelCloud& cloud, const SurfelShading&
   struct Key {
     uint64_t key;
     uint32_t surfel;
-    bool operator<(const Key& o) const {
-      return key != o.key ? key < o.key : surfel < o.surfel;
-    }
+    bool operator<(const Key& o) const { return key != o.key ? key < o.key : surfel < o.surfel; }
   };
   std::vector<Key> order(n);
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
@@ -260,8 +258,8 @@ PointTree::Blobs PointTree::Build(const SurfelCloud& cloud, const SurfelShading&
             SetEmpty(g, k);
             continue;
           }
-          const uint32_t children = static_cast<uint32_t>(
-              std::min<uint64_t>(kLanes, sizes[level - 1] - at * kLanes));
+          const uint32_t children =
+              static_cast<uint32_t>(std::min<uint64_t>(kLanes, sizes[level - 1] - at * kLanes));
           const uint32_t child_group = first_group[level - 1] + static_cast<uint32_t>(at);
           MakeParent(nodes[child_group], &below[at * kLanes], children, g, k, above[at]);
           MakeParentRadiance(nodes[child_group], radiance[child_group], children, r, k);

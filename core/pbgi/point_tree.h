@@ -29,13 +29,13 @@ inline constexpr uint32_t kLanes = 8;
 // Eight nodes. Lengths in metres, positions relative to the scene's origin.
 struct alignas(32) NodeGroup {
   float cx[kLanes], cy[kLanes], cz[kLanes];  // area-weighted centre
-  float radius[kLanes];         // of a sphere about the centre that holds all discs; -1: empty slot
-  float thickness[kLanes];      // half height along the mean normal of all discs below
+  float radius[kLanes];     // of a sphere about the centre that holds all discs; -1: empty slot
+  float thickness[kLanes];  // half height along the mean normal of all discs below
   float nx[kLanes], ny[kLanes], nz[kLanes];  // Σ A n / Σ A: as short as the normals spread
-  float sin_cone[kLanes];       // sine of the largest angle to the mean normal; 1: 90° or more
-  float area[kLanes];           // Σ A, m²
-  float front_area[kLanes];     // Σ A of surfels whose front is visible
-  float back_area[kLanes];      // Σ A of surfels whose back is visible
+  float sin_cone[kLanes];    // sine of the largest angle to the mean normal; 1: 90° or more
+  float area[kLanes];        // Σ A, m²
+  float front_area[kLanes];  // Σ A of surfels whose front is visible
+  float back_area[kLanes];   // Σ A of surfels whose back is visible
 };
 static_assert(sizeof(NodeGroup) == 384);
 

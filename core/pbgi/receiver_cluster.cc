@@ -36,7 +36,8 @@ std::vector<uint32_t> DrawSeeds(size_t n, uint32_t k, uint64_t key) {
   return index;
 }
 
-float Distance(const Vec3f& p_x, const Vec3f& n_x, const Vec3f& p_c, const Vec3f& n_c, float alpha) {
+float Distance(const Vec3f& p_x, const Vec3f& n_x, const Vec3f& p_c, const Vec3f& n_c,
+               float alpha) {
   const Vec3f dp = p_c - p_x;
   const Vec3f dn = n_c - n_x;
   return Dot(dp, dp) + alpha * Dot(dn, dn);
@@ -61,8 +62,8 @@ void UpdateCentres(std::span<const Receiver> receivers, const std::vector<uint32
   }
   for (size_t c = 0; c < k; ++c) {
     if (count[c] == 0) {
-      const size_t worst = static_cast<size_t>(
-          std::max_element(distance.begin(), distance.end()) - distance.begin());
+      const size_t worst = static_cast<size_t>(std::max_element(distance.begin(), distance.end()) -
+                                               distance.begin());
       centres.position[c] = receivers[worst].position;
       centres.normal[c] = receivers[worst].normal;
       distance[worst] = -1.0f;
@@ -144,8 +145,7 @@ std::vector<uint32_t> KMeans(std::span<const Receiver> receivers, const ClusterP
                              Assign&& assign) {
   std::vector<uint32_t> cluster_of(receivers.size(), 0);
   if (receivers.empty()) return cluster_of;
-  const uint32_t k = static_cast<uint32_t>(
-      std::clamp<size_t>(params.k, 1, receivers.size()));
+  const uint32_t k = static_cast<uint32_t>(std::clamp<size_t>(params.k, 1, receivers.size()));
   const float alpha = NormalWeight(receivers, params);
   Centres centres;
   for (const uint32_t s : DrawSeeds(receivers.size(), k, params.seed_key)) {
@@ -177,8 +177,8 @@ void Measure(std::span<const Receiver> receivers, float alpha, ReceiverCluster& 
       Vec3f(NormalizeOr(normal, Vec3d(receivers[cluster.members.front()].normal)));
   float best = std::numeric_limits<float>::infinity();
   for (const uint32_t i : cluster.members) {
-    const float d = Distance(receivers[i].position, receivers[i].normal, centre,
-                             cluster.mean_normal, alpha);
+    const float d =
+        Distance(receivers[i].position, receivers[i].normal, centre, cluster.mean_normal, alpha);
     if (d < best) {
       best = d;
       cluster.active = i;

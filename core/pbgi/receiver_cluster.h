@@ -12,29 +12,30 @@ namespace farpoint {
 // A shaded image sample, as the gather needs it. Positions are relative to the scene's origin.
 struct Receiver {
   Vec3f position;
-  Vec3f normal;             // unit shading normal, towards the viewer
-  Vec3f geometric_normal;   // unit, towards the viewer
-  bool on_back = false;     // the viewer sees the back of the triangle
+  Vec3f normal;            // unit shading normal, towards the viewer
+  Vec3f geometric_normal;  // unit, towards the viewer
+  bool on_back = false;    // the viewer sees the back of the triangle
 };
 
 struct ClusterParams {
-  uint32_t k = 100;              // clusters asked for; never more than receivers
-  uint32_t iterations = 5;       // of the k-means loop; fewer if it converges
+  uint32_t k = 100;         // clusters asked for; never more than receivers
+  uint32_t iterations = 5;  // of the k-means loop; fewer if it converges
   // α = normal_weight × squared diagonal of the receivers' bounding box. Erratum: the paper says
   // the diagonal itself, a length against a squared length, which would make the result depend on
-  // the scene's unit; with α in m² scaling a scene changes nothing (DESIGN §3).
+  // the scene's unit; with α in m² scaling a scene changes nothing.
   float normal_weight = 1.0f;
-  uint64_t seed_key = 0;         // from the block's coordinates, never from time, thread or tile
+  uint64_t seed_key = 0;  // from the block's coordinates, never from time, thread or tile
 };
 
 struct ReceiverCluster {
   std::vector<uint32_t> members;  // indices of receivers, ascending, not empty
-  uint32_t active = 0;             // the member nearest to the centre under D
+  uint32_t active = 0;            // the member nearest to the centre under D
   Vec3f mean_normal;              // unit
-  float radius_m = 0;              // R_c: largest distance of a member from the active receiver
-  float sin_spread = 0, cos_spread = 1;   // of the largest angle between a member's normal and the mean
-  float margin_m = 0;                 // see CutView::margin_m
-  bool sees_inside = false;               // any member is on_back
+  float radius_m = 0;             // R_c: largest distance of a member from the active receiver
+  float sin_spread = 0,
+        cos_spread = 1;      // of the largest angle between a member's normal and the mean
+  float margin_m = 0;        // see CutView::margin_m
+  bool sees_inside = false;  // any member is on_back
 };
 
 // D(x, c) = |p_c - p_x|² + α |n_c - n_x|² (§3.1).

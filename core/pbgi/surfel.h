@@ -11,8 +11,8 @@ namespace farpoint {
 // Structure of arrays; all of one length. Positions are relative to the scene's origin.
 struct SurfelCloud {
   std::vector<Vec3f> position;
-  std::vector<Vec3f> normal;      // unit, geometric, by the winding: the front side
-  std::vector<float> area_m2;     // of the surface that the surfel stands for; sums to the scene's
+  std::vector<Vec3f> normal;   // unit, geometric, by the winding: the front side
+  std::vector<float> area_m2;  // of the surface that the surfel stands for; sums to the scene's
   std::vector<uint32_t> triangle;
   std::vector<Vec2f> barycentric;  // weights of vertices 1 and 2
 
@@ -26,7 +26,7 @@ enum SurfelSide : uint8_t { kFrontVisible = 1, kBackVisible = 2 };
 
 // What the surfels reflect. All of one length, parallel to a SurfelCloud.
 struct SurfelShading {
-  std::vector<Rgb> front, back;       // reflected radiance, W/(m² sr), diffuse: the same all round
+  std::vector<Rgb> front, back;  // reflected radiance, W/(m² sr), diffuse: the same all round
   std::vector<uint8_t> visible_sides;  // SurfelSide bits
 };
 

@@ -100,7 +100,8 @@ SurfelCloud SampleObject(const PreparedScene& scene, const PreparedObject& objec
     const uint32_t triangle_seed = static_cast<uint32_t>(HashKey(key, j));
     const uint32_t in_triangle = static_cast<uint32_t>(end - std::max(first, 0.0));
     for (uint32_t k = 0; k < in_triangle && drawn < n; ++k) {
-      const Vec2f b = UniformTriangle(OwenSobol(k, 0, triangle_seed), OwenSobol(k, 1, triangle_seed));
+      const Vec2f b =
+          UniformTriangle(OwenSobol(k, 0, triangle_seed), OwenSobol(k, 1, triangle_seed));
       ++drawn;
       // A hole in an alpha mask is no surface.
       if (masked && scene.Alpha(t, b.x, b.y) < alpha_cutoff) continue;

@@ -23,8 +23,7 @@ bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, u
   const Vec3f origin = accel.LeaveSurface(p, ng);
   const uint32_t seed = static_cast<uint32_t>(key);
   for (uint32_t i = 0; i < kInteriorRays; ++i) {
-    const Vec3f w =
-        frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
+    const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
     ++counts.interior;
     const std::optional<RayHit> hit = accel.Intersect(origin, w);
     if (!hit || Dot(accel.scene().GeometricNormal(hit->triangle), w) < 0.0f) return false;
@@ -67,8 +66,7 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
         const Vec3f ns = side == 0 ? ns_front : -ns_front;
         const uint64_t side_key = HashKey(key, static_cast<uint64_t>(side));
-        const bool inside =
-            SeesOnlyBackFaces(accel, p, ng, HashKey(side_key, 5), counts);
+        const bool inside = SeesOnlyBackFaces(accel, p, ng, HashKey(side_key, 5), counts);
         if (inside) {
           const Rgb probe = lights.Irradiance(p, ng, ns, 1, side_key, 0, 0, light_counters);
           if (!(MaxComponent(probe) > 0.0f)) {

@@ -16,7 +16,7 @@ namespace {
 // that it is no disc at any distance: descend.
 constexpr float kMinCoherence2 = 0.5f;
 // Discs whose plane passes within this part of their radius of the receiver, with agreeing
-// normals, are the receiver's own surface seen through its curvature or folds (DESIGN §3).
+// normals, are the receiver's own surface seen through its curvature or folds.
 constexpr float kSelfPlaneFactor = 0.6f;
 constexpr float kSelfNormalCosine = 0.5f;
 // Pixels of the cosine map grow towards the horizon; their growth counts up to here.
@@ -24,9 +24,9 @@ constexpr float kMinZenithCosine = 0.1f;
 
 // Eight lanes' verdicts as bit masks.
 struct Verdict {
-  unsigned splat = 0;    // take the node as it is
+  unsigned splat = 0;  // take the node as it is
   unsigned descend = 0;
-  unsigned near = 0;     // stop here, receivers go on
+  unsigned near = 0;        // stop here, receivers go on
   F8 dx, dy, dz, distance;  // from the view to the centre
   F8 facing;                // mean normal · (dx, dy, dz)
 };
@@ -64,13 +64,23 @@ struct LaneView {
   bool flat, everything_visible_above, sees_inside, cosine_map, sharing;
 
   LaneView(const CutView& view, const CutParams& params, bool want_near)
-      : px(Set8(view.position.x)), py(Set8(view.position.y)), pz(Set8(view.position.z)),
-        nx(Set8(view.normal.x)), ny(Set8(view.normal.y)), nz(Set8(view.normal.z)),
-        radius(Set8(view.radius_m)), epsilon(Set8(params.epsilon)),
-        sin_spread(Set8(view.sin_spread)), cos_spread(Set8(view.cos_spread)),
-        margin(Set8(view.margin_m)), size_limit(Set8(params.pixel_sr * kCutPixels * kInvPif)), zero(Set8(0)),
-        flat(view.sin_spread == 0.0f), everything_visible_above(view.sin_spread >= 1.0f),
-        sees_inside(view.sees_inside), cosine_map(params.map == BufferMap::kCosine),
+      : px(Set8(view.position.x)),
+        py(Set8(view.position.y)),
+        pz(Set8(view.position.z)),
+        nx(Set8(view.normal.x)),
+        ny(Set8(view.normal.y)),
+        nz(Set8(view.normal.z)),
+        radius(Set8(view.radius_m)),
+        epsilon(Set8(params.epsilon)),
+        sin_spread(Set8(view.sin_spread)),
+        cos_spread(Set8(view.cos_spread)),
+        margin(Set8(view.margin_m)),
+        size_limit(Set8(params.pixel_sr * kCutPixels * kInvPif)),
+        zero(Set8(0)),
+        flat(view.sin_spread == 0.0f),
+        everything_visible_above(view.sin_spread >= 1.0f),
+        sees_inside(view.sees_inside),
+        cosine_map(params.map == BufferMap::kCosine),
         sharing(want_near) {}
 };
 
@@ -146,8 +156,8 @@ Verdict Judge(const NodeGroup& g, const LaneView& v, bool leaf, CutCounters& cou
   if (leaf) {
     // A surfel that straddles the border between near and far is near.
     near = v.sharing ? (alive & ~far) : near;
-    const M8 own_surface = (Abs8(facing) < Set8(kSelfPlaneFactor) * r) &
-                           (Abs8(n_dot_m) > Set8(kSelfNormalCosine));
+    const M8 own_surface =
+        (Abs8(facing) < Set8(kSelfPlaneFactor) * r) & (Abs8(n_dot_m) > Set8(kSelfNormalCosine));
     out.splat = Bits8(far & ~own_surface);
     out.near = Bits8(near);
   } else {

@@ -21,8 +21,8 @@ struct CutView {
   float sin_spread = 0;  // of the largest angle between a receiver's normal and `normal`;
                          // 1 if that is 90° or more: then nothing lies below every horizon
   float cos_spread = 1;
-  float margin_m = 0;    // max over receivers x of n_x·(p_active - p_x), at least 0: how far a
-                         // horizon lies below the active receiver's
+  float margin_m = 0;  // max over receivers x of n_x·(p_active - p_x), at least 0: how far a
+                       // horizon lies below the active receiver's
   // A receiver looks from the back of its own triangle: the sides that only such receivers can see
   // (core/pbgi/surfel.h) count as visible.
   bool sees_inside = false;
@@ -32,20 +32,22 @@ inline constexpr float kCutPixels = 4.0f;
 
 // When to descend.
 struct CutParams {
-  // far: R_c < epsilon (d - r); near: R_c >= epsilon (d + r) (§3.2 with its erratum, DESIGN §3:
-  // the measure γ = R_c / d is small for far nodes), everything between descends.
+  // far: R_c < epsilon (d - r); near: R_c >= epsilon (d + r) (§3.2 with its erratum,
+  // docs/paper-map.md: the measure γ = R_c / d is small for far nodes), everything between
+  // descends.
   float epsilon = 0.1f;
   // A node is fine enough if its sphere's solid angle pi r²/d² is at most that of kCutPixels
-  // pixels in its direction: a node is flat and seen at an angle, so what it covers is less. kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
+  // pixels in its direction: a node is flat and seen at an angle, so what it covers is less.
+  // kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
   BufferMap map = BufferMap::kOctahedral;
   float pixel_sr = 0.01f;
 };
 
 // A node of a cut, with what drawing it needs: most nodes are drawn without a look into the tree.
 struct CutNode {
-  uint32_t slot;      // group * 8 + lane
-  float distance_m;   // from the view's position to the node's centre
-  Vec3f direction;    // unit, from the view to the node's centre, world
+  uint32_t slot;     // group * 8 + lane
+  float distance_m;  // from the view's position to the node's centre
+  Vec3f direction;   // unit, from the view to the node's centre, world
   // Ω = A_visible |n·w| / d² [sr]; negative if the node shows its back.
   float signed_solid_angle;
 };
@@ -72,8 +74,8 @@ void ComputeClusterCut(const PointTree& tree, const CutView& view, const CutPara
 // The cut of one receiver below the near nodes of its cluster's cut (§3.3).
 // `near_groups` is the packed form of the near nodes (PackNearNodes).
 struct PackedNearNodes {
-  std::vector<NodeGroup> groups;   // copies, eight to a group, rest empty
-  std::vector<NearNode> nodes;     // parallel to the lanes
+  std::vector<NodeGroup> groups;  // copies, eight to a group, rest empty
+  std::vector<NearNode> nodes;    // parallel to the lanes
   void Pack(const PointTree& tree, std::span<const NearNode> near);
 };
 void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutParams& params,

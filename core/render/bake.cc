@@ -19,7 +19,9 @@ namespace {
 class StageTimer {
  public:
   StageTimer(Stats& stats, Stage stage)
-      : stats_(stats), stage_(static_cast<int>(stage)), wall_(std::chrono::steady_clock::now()),
+      : stats_(stats),
+        stage_(static_cast<int>(stage)),
+        wall_(std::chrono::steady_clock::now()),
         cpu_(ProcessCpuSeconds()) {}
   ~StageTimer() {
     stats_.wall_seconds[stage_] +=

@@ -11,8 +11,12 @@ namespace farpoint {
 class CameraRays {
  public:
   CameraRays(const Camera& camera, const FilmSpec& film, const Vec3d& scene_origin)
-      : eye_(camera.eye - scene_origin), forward_(camera.forward),
-        right_(camera.right), up_(camera.up), width_(film.width), height_(film.height),
+      : eye_(camera.eye - scene_origin),
+        forward_(camera.forward),
+        right_(camera.right),
+        up_(camera.up),
+        width_(film.width),
+        height_(film.height),
         half_height_(DetTan(0.5 * camera.yfov_rad)) {}
 
   // Relative to the scene's origin.

@@ -70,8 +70,10 @@ struct Sample {
 class Renderer final : public FrameRenderer {
  public:
   Renderer(std::shared_ptr<const LoadedScene> scene, const FrameSpec& frame)
-      : holder_(std::move(scene)), scene_(static_cast<const LoadedSceneData&>(*holder_)),
-        frame_(frame), settings_(frame.settings),
+      : holder_(std::move(scene)),
+        scene_(static_cast<const LoadedSceneData&>(*holder_)),
+        frame_(frame),
+        settings_(frame.settings),
         rays_(frame.camera, frame.film, scene_.scene->origin()),
         map_(settings_.buffer_map, settings_.microbuffer_px()) {
     cut_params_.epsilon = settings_.epsilon;
@@ -81,8 +83,8 @@ class Renderer final : public FrameRenderer {
       return std::find(settings_.layers.begin(), settings_.layers.end(), layer) !=
              settings_.layers.end();
     };
-    wants_irradiance_ = wants(Layer::kIrradiance) || wants(Layer::kStdError) ||
-                        wants(Layer::kCutSize);
+    wants_irradiance_ =
+        wants(Layer::kIrradiance) || wants(Layer::kStdError) || wants(Layer::kCutSize);
     wants_direct_irradiance_ = wants(Layer::kDirectIrradiance);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
@@ -204,8 +206,8 @@ class Renderer final : public FrameRenderer {
       for (int x = block.x0; x < block.x1; ++x) {
         for (uint32_t s = 0; s < settings_.spp; ++s, ++at) {
           const Vec2f offset = SamplePosition(x, y, s);
-          const Vec3f w = rays_.Direction(x + static_cast<double>(offset.x),
-                                          y + static_cast<double>(offset.y));
+          const Vec3f w =
+              rays_.Direction(x + static_cast<double>(offset.x), y + static_cast<double>(offset.y));
           ++n.rays;
           const std::optional<RayHit> hit = scene_.accel->Intersect(rays_.eye(), w);
           Sample& sample = samples[at];
@@ -297,9 +299,9 @@ class Renderer final : public FrameRenderer {
       params.k = settings_.clusters_per_block();
       params.iterations = settings_.kmeans_iterations;
       params.normal_weight = settings_.normal_weight;
-      params.seed_key = HashKey(settings_.seed, kKeyCluster,
-                                static_cast<uint64_t>(block.x0 / kBlockSize),
-                                static_cast<uint64_t>(block.y0 / kBlockSize));
+      params.seed_key =
+          HashKey(settings_.seed, kKeyCluster, static_cast<uint64_t>(block.x0 / kBlockSize),
+                  static_cast<uint64_t>(block.y0 / kBlockSize));
       clusters = ClusterReceivers(receivers, params);
       clock.Charge(Stage::kCluster);
     } else {
@@ -401,7 +403,8 @@ class Renderer final : public FrameRenderer {
       for (int x = inside.x0; x < inside.x1; ++x) {
         const size_t first =
             (static_cast<size_t>(y - block.y0) * static_cast<size_t>(block.width()) +
-             static_cast<size_t>(x - block.x0)) * spp;
+             static_cast<size_t>(x - block.x0)) *
+            spp;
         Rgb direct, indirect, emission, albedo, irradiance, direct_irradiance, error;
         Vec3f normal;
         Vec3d position;
@@ -436,8 +439,8 @@ class Renderer final : public FrameRenderer {
         const float inverse_hits = hits > 0 ? 1.0f / static_cast<float>(hits) : 0.0f;
         irradiance *= inverse_hits;
         direct_irradiance *= inverse_hits;
-        const Rgb se = Rgb(std::sqrt(error.x), std::sqrt(error.y), std::sqrt(error.z)) *
-                       inverse_hits;
+        const Rgb se =
+            Rgb(std::sqrt(error.x), std::sqrt(error.y), std::sqrt(error.z)) * inverse_hits;
         const Rgb beauty = direct + indirect + emission;
         finite = finite && IsFinite(beauty) && IsFinite(irradiance) && IsFinite(direct_irradiance);
         const Vec3f p(position * static_cast<double>(inverse_hits));
@@ -454,20 +457,42 @@ class Renderer final : public FrameRenderer {
               film.Set(layer, x, y, values);
               break;
             }
-            case Layer::kDirect: set(direct); break;
-            case Layer::kIndirect: set(indirect); break;
-            case Layer::kEmission: set(emission); break;
-            case Layer::kAlbedo: set(albedo); break;
-            case Layer::kNormal: set(NormalizeOr(normal, Vec3f())); break;
-            case Layer::kPosition: set(hits > 0 ? p : Vec3f()); break;
+            case Layer::kDirect:
+              set(direct);
+              break;
+            case Layer::kIndirect:
+              set(indirect);
+              break;
+            case Layer::kEmission:
+              set(emission);
+              break;
+            case Layer::kAlbedo:
+              set(albedo);
+              break;
+            case Layer::kNormal:
+              set(NormalizeOr(normal, Vec3f()));
+              break;
+            case Layer::kPosition:
+              set(hits > 0 ? p : Vec3f());
+              break;
             case Layer::kDepth:
               set1(hits > 0 ? depth * inverse_hits : std::numeric_limits<float>::infinity());
               break;
-            case Layer::kIrradiance: set(irradiance); break;
-            case Layer::kDirectIrradiance: set(direct_irradiance); break;
-            case Layer::kStdError: set(se); break;
-            case Layer::kCluster: set1(hits > 0 ? cluster * inverse_hits : -1.0f); break;
-            case Layer::kCutSize: set1(cut_size * inverse_hits); break;
+            case Layer::kIrradiance:
+              set(irradiance);
+              break;
+            case Layer::kDirectIrradiance:
+              set(direct_irradiance);
+              break;
+            case Layer::kStdError:
+              set(se);
+              break;
+            case Layer::kCluster:
+              set1(hits > 0 ? cluster * inverse_hits : -1.0f);
+              break;
+            case Layer::kCutSize:
+              set1(cut_size * inverse_hits);
+              break;
           }
         }
       }

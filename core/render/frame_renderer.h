@@ -22,7 +22,7 @@ struct FrameSpec {
 };
 
 struct TileOutput {
-  Film film;    // rounded to storage; covers exactly the tile
+  Film film;  // rounded to storage; covers exactly the tile
   Stats stats;
 };
 

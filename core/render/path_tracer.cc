@@ -25,8 +25,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
   for (uint32_t i = 0; i < paths; ++i) {
     const uint32_t b = static_cast<uint32_t>(uint64_t{i} * kBatches / paths);
     ++batch_count[b];
-    const Vec3f w =
-        frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
+    const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
     // Directions that the shading normal allows and the surface does not carry nothing.
     if (!(Dot(w, receiver.geometric_normal) > 0.0f)) continue;
     ++rays;
@@ -56,8 +55,8 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
       variance += d * d;
     }
     variance = variance / (kBatches * (kBatches - 1.0));
-    out.standard_error = Rgb(Vec3d(std::sqrt(variance.x), std::sqrt(variance.y),
-                                   std::sqrt(variance.z)) * kPi);
+    out.standard_error =
+        Rgb(Vec3d(std::sqrt(variance.x), std::sqrt(variance.y), std::sqrt(variance.z)) * kPi);
   }
   return out;
 }

@@ -17,8 +17,9 @@ struct TracedIrradiance {
 
 // E = pi/N Σ_i albedo(y_i)/pi E_direct(y_i), y_i the hit of the i-th cosine-distributed direction
 // about the shading normal; E_direct with one shadow ray per light. Unbiased. Owen-scrambled
-// Sobol' points: dimensions 0, 1 choose the direction, 2, 3 the point on the light. The standard error comes from eight consecutive runs of N/8 paths, whose own errors
-// are larger than their share of the whole sequence's: it errs on the high side.
+// Sobol' points: dimensions 0, 1 choose the direction, 2, 3 the point on the light. The standard
+// error comes from eight consecutive runs of N/8 paths, whose own errors are larger than their
+// share of the whole sequence's: it errs on the high side.
 TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights,
                                const Receiver& receiver, uint32_t paths, uint64_t key,
                                LightCounters& counters, uint64_t& rays);

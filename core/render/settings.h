@@ -27,9 +27,9 @@ struct RenderSettings {
   uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default
   BufferMap buffer_map = BufferMap::kOctahedral;
   Splat splat = Splat::kCoverage;
-  uint32_t clusters = 0;        // k per block, 1..1024; 0: the default
-  float epsilon = 0.2f;         // far: R_cluster < epsilon (d - r); >= 0
-  float normal_weight = 1.0f;   // alpha / squared block diagonal (paper §3.1)
+  uint32_t clusters = 0;           // k per block, 1..1024; 0: the default
+  float epsilon = 0.2f;            // far: R_cluster < epsilon (d - r); >= 0
+  float normal_weight = 1.0f;      // alpha / squared block diagonal (paper §3.1)
   uint32_t kmeans_iterations = 5;  // 0..100
   uint64_t seed = 0;
   std::vector<Layer> layers = DefaultLayers();
@@ -46,8 +46,9 @@ struct RenderSettings {
 // kInvalidArgument names the setting, its value and what is allowed.
 absl::Status ValidateSettings(const RenderSettings& settings);
 
-// Every parameter as in the paper (DESIGN §8): 32x32 blocks, k = 100, epsilon = 0.1, opaque splats,
-// depth composite, 5 iterations, 24x24 buffers.
+// Every parameter as in the paper: 32x32 blocks, k = 100, epsilon = 0.1, opaque splats,
+// depth composite, 5 iterations, 24x24 buffers. What differs from the paper whatever the parameters
+// stands in docs/paper-map.md.
 void ApplyPaperPreset(RenderSettings& settings);
 
 absl::StatusOr<Integrator> IntegratorFromName(std::string_view name);

@@ -76,9 +76,9 @@ TEST(SphereWithLight, IndirectIsRhoTimesDirect) {
   for (int i = 0; i <= kRings; ++i) {
     for (int j = 0; j < kSegments; ++j) {
       const SinCos t = DetSinCos(kPi * i / kRings), p = DetSinCos(2 * kPi * j / kSegments);
-      sphere.positions.push_back(Vec3f(static_cast<float>(t.sin * p.cos),
-                                       static_cast<float>(t.cos),
-                                       static_cast<float>(t.sin * p.sin)) * kRadius);
+      sphere.positions.push_back(Vec3f(static_cast<float>(t.sin * p.cos), static_cast<float>(t.cos),
+                                       static_cast<float>(t.sin * p.sin)) *
+                                 kRadius);
     }
   }
   const auto at = [&](int i, int j) {
@@ -87,7 +87,8 @@ TEST(SphereWithLight, IndirectIsRhoTimesDirect) {
   for (int i = 0; i < kRings; ++i) {
     for (int j = 0; j < kSegments; ++j) {
       if (i > 0) sphere.triangles.push_back({at(i, j), at(i, j + 1), at(i + 1, j)});
-      if (i + 1 < kRings) sphere.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
+      if (i + 1 < kRings)
+        sphere.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
     }
   }
   Scene scene;

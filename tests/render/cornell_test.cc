@@ -43,7 +43,7 @@ TEST(Cornell, PaperPresetAgreesRoughly) {
   RenderSettings paper = Settings(Integrator::kFpbgi);
   ApplyPaperPreset(paper);
   const Rendered r = RenderScene(scene, scene.cameras[0], Whole(32, 32), paper);
-  // Opaque nearest-wins splats are that bad (DESIGN §3: rr 0.30), and no worse.
+  // Opaque nearest-wins splats are that bad, and no worse (docs/decisions/0003-coverage-splats.md).
   EXPECT_LE(Compare(r.film, truth.film, Layer::kIrradiance).rr, 0.40);
 }
 

@@ -1,4 +1,4 @@
-// What a frame's pixels may and may not depend on (DESIGN §4, §5, §6).
+// What a frame's pixels may and may not depend on (docs/decisions/0001-determinism.md).
 #include "tests/render/render_helpers.h"
 
 namespace farpoint {
@@ -11,8 +11,8 @@ RenderSettings Small(Integrator integrator) {
   s.paths = 16;
   s.clusters = 12;
   s.light_samples = 4;
-  s.layers = {Layer::kBeauty, Layer::kDirect, Layer::kIndirect, Layer::kEmission, Layer::kAlbedo,
-              Layer::kNormal, Layer::kPosition, Layer::kDepth, Layer::kIrradiance};
+  s.layers = {Layer::kBeauty, Layer::kDirect,   Layer::kIndirect, Layer::kEmission,  Layer::kAlbedo,
+              Layer::kNormal, Layer::kPosition, Layer::kDepth,    Layer::kIrradiance};
   return s;
 }
 
@@ -104,7 +104,8 @@ TEST(Frame, BeautyIsTheSumOfItsLayers) {
       RenderScene(scene, scene.cameras[0], Whole(48, 48), Small(Integrator::kFpbgi)).film;
   for (int c = 0; c < 3; ++c) {
     const auto beauty = film.Plane(Layer::kBeauty, c), direct = film.Plane(Layer::kDirect, c);
-    const auto indirect = film.Plane(Layer::kIndirect, c), emission = film.Plane(Layer::kEmission, c);
+    const auto indirect = film.Plane(Layer::kIndirect, c),
+               emission = film.Plane(Layer::kEmission, c);
     const auto albedo = film.Plane(Layer::kAlbedo, c), e = film.Plane(Layer::kIrradiance, c);
     for (size_t i = 0; i < beauty.size(); ++i) {
       // Half precision: 2^-11 of each.
@@ -118,8 +119,7 @@ TEST(Frame, BeautyIsTheSumOfItsLayers) {
 TEST(Frame, WithoutLightIsBlackAndCostsNoGather) {
   Scene scene = MakeCornellBox();
   for (Material& m : scene.materials) m.emission = Rgb();
-  const Rendered r =
-      RenderScene(scene, scene.cameras[0], Whole(32, 32), Small(Integrator::kFpbgi));
+  const Rendered r = RenderScene(scene, scene.cameras[0], Whole(32, 32), Small(Integrator::kFpbgi));
   for (int c = 0; c < 3; ++c) {
     for (const float v : r.film.Plane(Layer::kBeauty, c)) EXPECT_EQ(v, 0.0f);
   }
@@ -139,8 +139,7 @@ TEST(Frame, BackgroundOnlyBlocksCostNothing) {
 TEST(Frame, TinyImagesWork) {
   const Scene scene = MakeCornellBox();
   for (const auto& [w, h] : {std::pair(1, 1), std::pair(1, 70), std::pair(33, 32)}) {
-    const Rendered r =
-        RenderScene(scene, scene.cameras[0], Whole(w, h), Small(Integrator::kFpbgi));
+    const Rendered r = RenderScene(scene, scene.cameras[0], Whole(w, h), Small(Integrator::kFpbgi));
     for (const float v : r.film.Plane(Layer::kIrradiance, 0)) EXPECT_TRUE(std::isfinite(v));
   }
 }
@@ -170,13 +169,14 @@ TEST(Frame, CancelStopsATile) {
       FrameRenderer::Create(loaded, {scene.cameras[0], Whole(128, 128), s}).value();
   std::atomic<bool> cancel{false};
   int blocks = 0;
-  const auto tile = renderer->RenderTile({0, 0, 128, 128}, executor,
-                                         [&](int done, int total) {
-                                           EXPECT_EQ(total, 16);
-                                           blocks = done;
-                                           if (done == 3) cancel = true;
-                                         },
-                                         &cancel);
+  const auto tile = renderer->RenderTile(
+      {0, 0, 128, 128}, executor,
+      [&](int done, int total) {
+        EXPECT_EQ(total, 16);
+        blocks = done;
+        if (done == 3) cancel = true;
+      },
+      &cancel);
   EXPECT_EQ(tile.status().code(), absl::StatusCode::kCancelled);
   EXPECT_EQ(blocks, 3);
 }

@@ -13,12 +13,12 @@ Scene TwoRooms(bool facing_lamp) {
   const auto quad = [&](Vec3f a, Vec3f b, Vec3f c, Vec3f e) {
     AddLambert(scene, QuadMesh(a, b, c, e), 0.8f);
   };
-  quad({-w, 0, d}, {w, 0, d}, {w, 0, -d}, {-w, 0, -d});      // floor, up
-  quad({-w, h, -d}, {w, h, -d}, {w, h, d}, {-w, h, d});      // ceiling, down
-  quad({-w, 0, -d}, {w, 0, -d}, {w, h, -d}, {-w, h, -d});    // back
-  quad({-w, 0, d}, {-w, h, d}, {w, h, d}, {w, 0, d});        // front
-  quad({-w, 0, d}, {-w, 0, -d}, {-w, h, -d}, {-w, h, d});    // left
-  quad({w, 0, -d}, {w, 0, d}, {w, h, d}, {w, h, -d});        // right
+  quad({-w, 0, d}, {w, 0, d}, {w, 0, -d}, {-w, 0, -d});    // floor, up
+  quad({-w, h, -d}, {w, h, -d}, {w, h, d}, {-w, h, d});    // ceiling, down
+  quad({-w, 0, -d}, {w, 0, -d}, {w, h, -d}, {-w, h, -d});  // back
+  quad({-w, 0, d}, {-w, h, d}, {w, h, d}, {w, 0, d});      // front
+  quad({-w, 0, d}, {-w, 0, -d}, {-w, h, -d}, {-w, h, d});  // left
+  quad({w, 0, -d}, {w, 0, d}, {w, h, d}, {w, h, -d});      // right
   if (facing_lamp) {
     quad({0, 0, -d}, {0, 0, d}, {0, h, d}, {0, h, -d});
   } else {

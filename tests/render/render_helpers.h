@@ -23,9 +23,7 @@ inline Camera LookAt(const Vec3d& eye, const Vec3d& target, const Vec3d& up, dou
   return c;
 }
 
-inline FilmSpec Whole(int width, int height) {
-  return {width, height, {0, 0, width, height}};
-}
+inline FilmSpec Whole(int width, int height) { return {width, height, {0, 0, width, height}}; }
 
 struct Rendered {
   Film film;

@@ -200,7 +200,7 @@ TEST(DecodeFilm, AcceptsDamageOnlyIfItIsAnotherExactRecord) {
   EXPECT_GT(refused, 100);
 }
 
-// DESIGN: SHA-256 over the stored values per block, then over the blocks, then over the layers.
+// SHA-256 over the stored values per block, then over the blocks, then over the layers.
 TEST(LayerHash, IsTheDocumentedConstruction) {
   const PixelRect rect{31, 0, 33, 1};
   Film film(rect, {Layer::kDepth});

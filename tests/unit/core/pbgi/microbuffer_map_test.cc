@@ -43,8 +43,8 @@ TEST_P(Octahedral, CosineWeightsSumToPi) {
     const Vec3f n = UniformSphere(OwenSobol(i, 0, 1), OwenSobol(i, 1, 1));
     double sum = 0;
     for (uint32_t p = 0; p < map.pixels(); ++p) {
-      sum += std::max(0.0f, n.x * map.weight(0)[p] + n.y * map.weight(1)[p] +
-                                n.z * map.weight(2)[p]);
+      sum +=
+          std::max(0.0f, n.x * map.weight(0)[p] + n.y * map.weight(1)[p] + n.z * map.weight(2)[p]);
     }
     // Exact but for the pixels that straddle the horizon.
     EXPECT_NEAR(sum, kPi, kPi * 4.0 / (side * side)) << i;
@@ -68,9 +68,7 @@ TEST_P(Octahedral, WrapGivesTheNeighbourOnTheSphere) {
   const int n = static_cast<int>(GetParam());
   if (n < 8) return;
   const MicrobufferMap map(BufferMap::kOctahedral, GetParam());
-  const auto centre = [&](int32_t p) {
-    return Vec3f(map.dir(0)[p], map.dir(1)[p], map.dir(2)[p]);
-  };
+  const auto centre = [&](int32_t p) { return Vec3f(map.dir(0)[p], map.dir(1)[p], map.dir(2)[p]); };
   const float pixel_rad = 6.0f / static_cast<float>(n);  // the widest pixels
   for (int i = 0; i < n; ++i) {
     EXPECT_LT(Length(centre(map.Wrap(i, -1)) - centre(map.Wrap(i, 0))), pixel_rad);

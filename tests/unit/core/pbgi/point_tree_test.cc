@@ -73,8 +73,7 @@ TEST_P(PointTreeSize, NodesBoundAndSumWhatIsBelowThem) {
         front += leaf.front_area[l];
         normal += Vec3d(n) * static_cast<double>(leaf.area[l]);
         const RadianceGroup& r = tree->radiance(s / kLanes);
-        flux += Vec3d(r.lane[l].front) *
-                static_cast<double>(leaf.front_area[l]);
+        flux += Vec3d(r.lane[l].front) * static_cast<double>(leaf.front_area[l]);
       });
       EXPECT_NEAR(g.area[k], area, area * 1e-5);
       EXPECT_NEAR(g.front_area[k], front, area * 1e-5);

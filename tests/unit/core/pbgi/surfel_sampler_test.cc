@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "core/scene/procedural.h"
+#include "tests/unit/core/scene/scene_test_util.h"
 
 namespace farpoint {
 namespace {
@@ -25,7 +26,8 @@ TEST(SurfelSampler, GivesAboutTheCountAndTheWholeArea) {
   Executor executor(2);
   for (const uint64_t n : {2000u, 20000u, 88880u}) {
     const SurfelCloud cloud = SampleSurfels(*scene, n, 0, executor);
-    EXPECT_NEAR(static_cast<double>(cloud.size()), static_cast<double>(n), 0.08 * static_cast<double>(n));
+    EXPECT_NEAR(static_cast<double>(cloud.size()), static_cast<double>(n),
+                0.08 * static_cast<double>(n));
     double area = 0;
     for (const float a : cloud.area_m2) area += a;
     EXPECT_NEAR(area, SceneArea(*scene), 1e-4 * SceneArea(*scene));
@@ -46,7 +48,8 @@ TEST(SurfelSampler, IsBlueNoise) {
           scene->triangles()[cloud.triangle[j]].object) {
         continue;
       }
-      closest = std::min(closest, static_cast<double>(Length(cloud.position[i] - cloud.position[j])));
+      closest =
+          std::min(closest, static_cast<double>(Length(cloud.position[i] - cloud.position[j])));
     }
   }
   EXPECT_GT(closest, 0.7 * spacing);
@@ -90,6 +93,39 @@ TEST(SurfelSampler, AnObjectKeepsItsSurfelsWhenItsPeersChange) {
     if (after->triangles()[b.triangle[i]].object != last) pb.push_back(b.position[i]);
   }
   EXPECT_EQ(pa, pb);
+}
+
+TEST(SurfelSampler, HolesOfAlphaMasksAreNoSurface) {
+  // A square metre whose left half (u < 1/2) is a hole.
+  Scene scene;
+  Texture texture;
+  texture.name = "mask";
+  texture.nearest = true;
+  texture.encoded = Blob::FromString(MakePng(2, 1, {255, 255, 255, 0, 255, 255, 255, 255}));
+  scene.textures.push_back(texture);
+  Material material;
+  material.alpha_mode = AlphaMode::kMask;
+  material.base_color_texture.texture = 0;
+  scene.materials.push_back(material);
+  Mesh mesh;
+  mesh.positions = {{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};
+  mesh.uv[0] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
+  mesh.triangles = {{0, 1, 2}, {0, 2, 3}};
+  mesh.material = 0;
+  scene.meshes.push_back(mesh);
+  scene.instances.emplace_back();
+  Executor executor(1);
+  const auto prepared = PreparedScene::Prepare(scene, executor);
+  ASSERT_TRUE(prepared.ok()) << prepared.status();
+  ASSERT_TRUE((*prepared)->has_alpha_masks());
+  const SurfelCloud cloud = SampleSurfels(**prepared, 2000, 0, executor);
+  ASSERT_GT(cloud.size(), 500u);
+  double area = 0;
+  for (size_t i = 0; i < cloud.size(); ++i) {
+    EXPECT_GE(cloud.position[i].x + (*prepared)->origin().x, 0.5);
+    area += cloud.area_m2[i];
+  }
+  EXPECT_NEAR(area, 0.5, 0.005);
 }
 
 TEST(SurfelSampler, SmallObjectsGetAtLeastOne) {

@@ -29,7 +29,7 @@ Shaded Shade(const Scene& description, uint64_t n, unsigned threads = 1) {
 
 TEST(SurfelShader, FurnaceWallsReflectRhoL) {
   // Inside a closed box of emission L every wall receives pi L and reflects rho L.
-  const Shaded s = Shade(MakeFurnace(0.5f, 2.0f), 2000);
+  const Shaded s = Shade(MakeFurnace(0.5f, 2.0f), 20000);
   double sum = 0;
   size_t lit = 0;
   for (size_t i = 0; i < s.cloud.size(); ++i) {

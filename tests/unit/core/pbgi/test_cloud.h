@@ -65,8 +65,8 @@ inline TestCloud RandomCloud(int n, uint64_t seed) {
   TestCloud t;
   for (int i = 0; i < n; ++i) {
     const auto u = [&](int k) {
-      return ToUnitFloat(static_cast<uint32_t>(HashKey(seed, static_cast<uint64_t>(i),
-                                                       static_cast<uint64_t>(k))));
+      return ToUnitFloat(
+          static_cast<uint32_t>(HashKey(seed, static_cast<uint64_t>(i), static_cast<uint64_t>(k))));
     };
     t.Add({u(0) * 4 - 2, u(1) * 2 - 1, u(2) * 3 - 1}, UniformSphere(u(3), u(4)),
           0.0005f + 0.002f * u(5), Rgb(u(6), u(7), u(8)), Rgb(u(9), u(10), u(11)),
