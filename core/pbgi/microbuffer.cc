@@ -26,6 +26,11 @@ constexpr float kCoverageBoxScale = 1.4f;
 // 88,880 surfels, k = 100: rr 0.052 to 0.038, bias -2.9 % to -1.2 %; from 0.6 on rr 0.035, bias
 // -0.6 %, but a free disc of 115 pixels comes out 5 % too bright.
 constexpr float kFullFrom = 0.75f;
+// A pixel beyond kFullFrom takes nothing more that lies this much farther than what it took last:
+// that is another surface, behind the gaps of the one in front, and usually a darker one. Cornell,
+// k = 64: bias -1.6 % to -0.7 %; Sponza, pbgi, 1 M surfels, 128x100, against 2048 paths: rr 0.304
+// to 0.289, bias -8.9 % to -7.7 %.
+constexpr float kDepthJump = 1.05f;
 // Opaque discs are drawn this much larger, so that they leave no holes.
 constexpr float kOpaqueDiscScale = 1.4f;
 
@@ -84,13 +89,16 @@ class Rasterizer {
     return node.signed_solid_angle > 0.0f ? sides.front : sides.back;
   }
 
-  void AddCoverage(int32_t pixel, float alpha, const Rgb& radiance) {
+  void AddCoverage(int32_t pixel, float alpha, float distance_m, const Rgb& radiance) {
     float* coverage = buffer_.coverage();
+    float& depth = buffer_.depth()[pixel];  // of what was added last
     const float open = 1.0f - coverage[pixel];
-    if (!(open > 0.0f)) {
+    // What comes after a jump in depth lies behind a surface whose gaps it must not fill.
+    if (!(open > 0.0f) || (coverage[pixel] > kFullFrom && distance_m > kDepthJump * depth)) {
       ++counters_.hidden_pixels;
       return;
     }
+    depth = distance_m;
     const float a = std::min(alpha, open);
     coverage[pixel] += a;
     buffer_.radiance(0)[pixel] += a * radiance.x;
@@ -140,7 +148,7 @@ class Rasterizer {
         const float part_sr = per_area * ox * oy;
         if (!(part_sr > 0.0f)) continue;
         if (radiance == nullptr) radiance = &Radiance(node);
-        AddCoverage(pixel, part_sr / map_.solid_angle()[pixel], *radiance);
+        AddCoverage(pixel, part_sr / map_.solid_angle()[pixel], node.distance_m, *radiance);
       }
     }
   }
@@ -210,7 +218,7 @@ class Rasterizer {
           SetOpaque(static_cast<int32_t>(pixel), t_lanes[k], radiance);
         } else {
           const float q = 1.0f - rho2_lanes[k] / (support_m * support_m);
-          AddCoverage(static_cast<int32_t>(pixel), peak * q * q, radiance);
+          AddCoverage(static_cast<int32_t>(pixel), peak * q * q, node.distance_m, radiance);
         }
       }
     }

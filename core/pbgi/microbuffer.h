@@ -3,8 +3,9 @@
 //
 // Coverage splats (the default): nodes are taken front to back; a node covers of each pixel that it
 // touches the fraction alpha = Ω_node,pixel / Ω_pixel, Ω_node = A |n·w| / d², as long as the pixel
-// is not full. Opaque splats (the paper's): a node fills the pixels whose centres it covers, at
-// least the one of its own centre; the nearest wins.
+// is not full; a pixel covered for the most part is closed to surfaces behind (a jump in depth).
+// Opaque splats (the paper's): a node fills the pixels whose centres it covers, at least the one of
+// its own centre; the nearest wins.
 #pragma once
 
 #include <cstdint>
@@ -21,7 +22,7 @@
 
 namespace farpoint {
 
-// Radiance already weighted by coverage, coverage in [0, 1], depth of the nearest splat. Arrays
+// Radiance already weighted by coverage, coverage in [0, 1], a depth. Arrays
 // have map.padded() elements.
 class Microbuffer {
  public:
@@ -37,7 +38,8 @@ class Microbuffer {
   const float* radiance(int channel) const { return values_[channel]; }
   float* coverage() { return values_[3]; }
   const float* coverage() const { return values_[3]; }
-  float* depth() { return values_[4]; }  // metres; +inf where nothing is. Opaque splats only.
+  float* depth() { return values_[4]; }  // metres; +inf where nothing is.
+  // Opaque splats: of the nearest; coverage splats: of the last that found room.
   const float* depth() const { return values_[4]; }
   void MarkTouched() { ++touched_; }
   uint64_t touched() const { return touched_; }
