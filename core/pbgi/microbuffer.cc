@@ -89,7 +89,12 @@ class Rasterizer {
     return node.signed_solid_angle > 0.0f ? sides.front : sides.back;
   }
 
-  void AddCoverage(int32_t pixel, float alpha, float distance_m, const Rgb& radiance) {
+  // A dark back that is seen behind a front is, as a rule, the far side of the same closed object:
+  // it hides what the front hides already, not the rest of the pixel. (Added up like other surfaces
+  // the two would double every outline.) So dark backs first use up the coverage of the fronts
+  // before them, and only what goes beyond hides more: a sheet seen from behind with nothing before
+  // it hides all.
+  void AddCoverage(int32_t pixel, float alpha, float distance_m, bool back, const Rgb& radiance) {
     float* coverage = buffer_.coverage();
     float& depth = buffer_.depth()[pixel];  // of what was added last
     const float open = 1.0f - coverage[pixel];
@@ -97,6 +102,15 @@ class Rasterizer {
     if (!(open > 0.0f) || (coverage[pixel] > kFullFrom && distance_m > kDepthJump * depth)) {
       ++counters_.hidden_pixels;
       return;
+    }
+    float& credit = buffer_.front_credit()[pixel];
+    if (back && !(MaxComponent(radiance) > 0.0f)) {
+      const float used = std::min(alpha, credit);
+      credit -= used;
+      alpha -= used;
+      if (!(alpha > 0.0f)) return;
+    } else {
+      credit += alpha;
     }
     depth = distance_m;
     const float a = std::min(alpha, open);
@@ -148,7 +162,8 @@ class Rasterizer {
         const float part_sr = per_area * ox * oy;
         if (!(part_sr > 0.0f)) continue;
         if (radiance == nullptr) radiance = &Radiance(node);
-        AddCoverage(pixel, part_sr / map_.solid_angle()[pixel], node.distance_m, *radiance);
+        AddCoverage(pixel, part_sr / map_.solid_angle()[pixel], node.distance_m,
+                    node.signed_solid_angle < 0.0f, *radiance);
       }
     }
   }
@@ -218,7 +233,8 @@ class Rasterizer {
           SetOpaque(static_cast<int32_t>(pixel), t_lanes[k], radiance);
         } else {
           const float q = 1.0f - rho2_lanes[k] / (support_m * support_m);
-          AddCoverage(static_cast<int32_t>(pixel), peak * q * q, node.distance_m, radiance);
+          AddCoverage(static_cast<int32_t>(pixel), peak * q * q, node.distance_m,
+                      node.signed_solid_angle < 0.0f, radiance);
         }
       }
     }
@@ -237,9 +253,9 @@ class Rasterizer {
 }  // namespace
 
 Microbuffer::Microbuffer(const MicrobufferMap& map)
-    : map_(&map), storage_(5 * size_t{map.padded()}) {
+    : map_(&map), storage_(6 * size_t{map.padded()}) {
   // padded() is a multiple of 8 floats, so every plane is aligned for SIMD.
-  for (int i = 0; i < 5; ++i) values_[i] = storage_.data() + i * size_t{map.padded()};
+  for (int i = 0; i < 6; ++i) values_[i] = storage_.data() + i * size_t{map.padded()};
   touched_ = 1;
   Clear();
 }
@@ -249,6 +265,7 @@ void Microbuffer::Clear() {
   const size_t n = map_->padded();
   std::fill(values_[0], values_[0] + 4 * n, 0.0f);
   std::fill(values_[4], values_[4] + n, std::numeric_limits<float>::infinity());
+  std::fill(values_[5], values_[5] + n, 0.0f);
   touched_ = 0;
 }
 

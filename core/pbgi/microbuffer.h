@@ -41,13 +41,16 @@ class Microbuffer {
   float* depth() { return values_[4]; }  // metres; +inf where nothing is.
   // Opaque splats: of the nearest; coverage splats: of the last that found room.
   const float* depth() const { return values_[4]; }
+  // Coverage by fronts that has not yet been set against dark backs behind them; see the .cc.
+  // Coverage splats only.
+  float* front_credit() { return values_[5]; }
   void MarkTouched() { ++touched_; }
   uint64_t touched() const { return touched_; }
 
  private:
   const MicrobufferMap* map_;
   AlignedVector<float> storage_;
-  float* values_[5];
+  float* values_[6];
   uint64_t touched_ = 0;
 };
 
