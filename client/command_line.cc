@@ -389,7 +389,7 @@ absl::Status CheckCoordinator(const std::string& address) {
                         std::from_chars(address.data() + colon + 1, end, port).ptr == end &&
                         port > 0 && port < 65536;
   if (!has_port) {
-    return Bad("--coordinator " + address + ": expected HOST:PORT, e.g. farm.example:7420");
+    return Bad("--coordinator " + address + ": expected HOST:PORT, e.g. farm.example:7447");
   }
   return absl::OkStatus();
 }

@@ -49,9 +49,9 @@ absl::Status OutcomeOf(const JobStatus& status) {
       return absl::CancelledError("job " + status.id.value +
                                   " was cancelled; submit it again to render it");
     default:
-      return absl::FailedPreconditionError("job " + status.id.value + " is not done, it is " +
-                                           std::string(NameOf(status.state)) +
-                                           "; wait for it, farpoint status shows how far it is");
+      return absl::UnavailableError("job " + status.id.value + " is not done, it is " +
+                                    std::string(NameOf(status.state)) +
+                                    "; wait for it, farpoint status shows how far it is");
   }
 }
 

@@ -20,7 +20,7 @@ struct RetryPolicy {
 // Not thread-safe.
 class Retry {
  public:
-  // `peer` is for messages: "coordinator farm:7420". The references must outlive this.
+  // `peer` is for messages: "coordinator farm:7447". The references must outlive this.
   Retry(RetryPolicy policy, std::string peer, const StopFlag& stop, Console& console)
       : policy_(policy), peer_(std::move(peer)), stop_(stop), console_(console) {}
 

@@ -519,7 +519,9 @@ class CoordinatorImpl final : public Coordinator {
           job.stored.id);
     }
     EndJob(job, JobState::kFailed, error);
-    Log(CoordinatorLogEntry::Level::kError, "failed: " + error.ToString(), job.stored.id);
+    // Not this program's error: whoever watches the job gets it in full.
+    Log(CoordinatorLogEntry::Level::kInfo, "failed: " + std::string(error.message()),
+        job.stored.id);
   }
 
   void HandleNews(const SchedulerNews& news) {

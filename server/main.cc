@@ -47,7 +47,7 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
   app.add_option("--threads", flags.threads, "Threads that bake scenes; 0: all cores");
   app.add_option("--port-file", flags.port_file, "Write the chosen port to this file");
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
-      ->check(CLI::IsMember({"trace", "debug", "info", "warning", "error", "off"}))
+      ->check(CLI::IsMember({"trace", "debug", "info", "warn", "warning", "error", "off"}))
       ->capture_default_str();
   const auto number = [&app](const char* name, uint64_t& value, uint64_t min, const char* text) {
     app.add_option(name, value, text)

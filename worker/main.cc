@@ -76,7 +76,7 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
       ->check(CLI::Range(0, 86400))
       ->capture_default_str();
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
-      ->check(CLI::IsMember({"trace", "debug", "info", "warning", "error", "off"}))
+      ->check(CLI::IsMember({"trace", "debug", "info", "warn", "warning", "error", "off"}))
       ->capture_default_str();
 }
 
