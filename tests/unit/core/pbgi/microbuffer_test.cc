@@ -108,6 +108,37 @@ TEST(Microbuffer, NearHidesFar) {
   }
 }
 
+// The dark far side of a closed object must not hide more than its front does; a sheet of which
+// only the dark back is seen must hide what lies behind it.
+TEST(Microbuffer, ADarkBackHidesOnlyWhatNoFrontHidesAlready) {
+  const auto irradiance = [](bool front_side, bool far_side) {
+    TestCloud t;
+    AddSquare(t, 120, 60.0f, 12.0f, {0, 0, -1}, Rgb(1, 1, 1));  // a bright wall
+    // Slats narrower than a pixel: half open, half hidden.
+    for (int slat = -9; slat <= 9; ++slat) {
+      for (int i = -100; i <= 100; ++i) {
+        const float x = 0.4f * static_cast<float>(slat), y = 0.04f * static_cast<float>(i);
+        for (int k = -2; k < 2; ++k) {
+          const float dx = 0.05f * (static_cast<float>(k) + 0.5f);
+          if (front_side) t.Add({x + dx, y, 4.0f}, {0, 0, -1}, 0.002f, Rgb());
+          if (far_side) t.Add({x + dx, y, 4.2f}, {0, 0, 1}, 0.002f, Rgb(), Rgb());
+        }
+      }
+    }
+    const MicrobufferMap map(BufferMap::kOctahedral, 24);
+    CutView view;
+    view.normal = {0, 0, 1};
+    return Gather(*t.Build(), view, map, Splat::kCoverage).irradiance.x;
+  };
+  const float open = irradiance(false, false);
+  const float sheet = irradiance(true, false);
+  const float object = irradiance(true, true);
+  const float back = irradiance(false, true);
+  EXPECT_LT(sheet, 0.9f * open);
+  EXPECT_NEAR(object, sheet, 0.03f * open);  // added up it would be twice as dark
+  EXPECT_NEAR(back, sheet, 0.05f * open);
+}
+
 TEST(Microbuffer, CompositeIsFarWhereNearIsOpen) {
   const MicrobufferMap map(BufferMap::kOctahedral, 16);
   Microbuffer far(map), near(map);
