@@ -135,7 +135,7 @@ TEST_F(FarmTest, NothingIsLeftBesideTheImage) {
 TEST_F(FarmTest, ADetachedJobIsFetchedLater) {
   const std::string job = Detach(SmallScene());
   const RunResult early = Run({"fetch", job, "-o", farm_.File("early.exr")});
-  EXPECT_EQ(early.exit_code, 42);
+  EXPECT_EQ(early.exit_code, 75);
   EXPECT_THAT(early.err, AllOf(HasSubstr(job), HasSubstr("not done")));
   EXPECT_FALSE(std::filesystem::exists(farm_.File("early.exr")));
 

@@ -228,7 +228,7 @@ TEST_F(JobRunTest, GivesUpOnTilesThatAreAlwaysDamaged) {
 
 TEST_F(JobRunTest, DoesNotFetchWhatIsNotDone) {
   farm_.job.info.status.state = JobState::kRendering;
-  EXPECT_TRUE(absl::IsFailedPrecondition(run_.Fetch(JobId{"1"}).status()));
+  EXPECT_TRUE(absl::IsUnavailable(run_.Fetch(JobId{"1"}).status()));
 }
 
 TEST(OutcomeOf, IsOkOnlyForADoneJob) {
