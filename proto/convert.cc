@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <nlohmann/json.hpp>
 #include <set>
 
 namespace farpoint {
@@ -174,7 +175,15 @@ absl::StatusOr<v1::RenderJob> RenderJobFromJson(std::string_view text, std::stri
   const auto status = google::protobuf::util::JsonStringToMessage(
       google::protobuf::StringPiece(text.data(), text.size()), &job);
   if (status.ok()) return job;
-  const std::string message(status.message().data(), status.message().size());
+  std::string message(status.message().data(), status.message().size());
+  try {
+    // protobuf names no line; this parser does.
+    (void)nlohmann::json::parse(text.begin(), text.end());
+  } catch (const nlohmann::json::exception& e) {
+    return absl::InvalidArgumentError("'" + std::string(name) + "' is not a job file: " + e.what() +
+                                      "; correct the file there");
+  }
+  std::replace(message.begin(), message.end(), '\n', ' ');
   return absl::InvalidArgumentError("'" + std::string(name) + "' is not a job file: " + message +
                                     NearestField(message));
 }
