@@ -15,6 +15,10 @@ constexpr uint32_t kDefaultClusters = 64;
 
 constexpr std::array<std::string_view, 4> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt"};
 
+constexpr std::array<std::string_view, 4> kFilterNames = {"box", "triangle", "gaussian",
+                                                          "blackman-harris"};
+constexpr std::array<float, 4> kFilterWidths = {1.0f, 2.0f, 3.0f, 3.0f};
+
 template <typename T>
 absl::Status CheckRange(std::string_view name, T value, T low, T high) {
   if (value >= low && value <= high) return absl::OkStatus();
@@ -34,11 +38,22 @@ uint32_t RenderSettings::clusters_per_block() const {
   return clusters != 0 ? clusters : kDefaultClusters;
 }
 
+float RenderSettings::filter_width() const {
+  return filter_width_px != 0.0f ? filter_width_px : kFilterWidths[static_cast<size_t>(filter)];
+}
+
 absl::Status ValidateSettings(const RenderSettings& s) {
   if (static_cast<uint32_t>(s.integrator) >= kIntegratorNames.size()) {
     return absl::InvalidArgumentError("integrator: unknown value; use fpbgi, pbgi, dpbgi or pt");
   }
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("spp", s.spp, 1, 256));
+  if (static_cast<uint32_t>(s.filter) >= kFilterNames.size()) {
+    return absl::InvalidArgumentError(
+        "filter: unknown value; use box, triangle, gaussian or blackman-harris");
+  }
+  if (s.filter_width_px != 0.0f && !(s.filter_width_px >= 0.01f && s.filter_width_px <= 16.0f)) {
+    return absl::InvalidArgumentError("filter-width must be between 0.01 and 16 pixels");
+  }
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("paths", s.paths, 1, 1u << 20));
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("light-samples", s.light_samples, 1, 4096));
   FP_RETURN_IF_ERROR(CheckRange<uint64_t>("points", s.points, 0, uint64_t{1} << 31));
@@ -107,5 +122,15 @@ absl::StatusOr<Integrator> IntegratorFromName(std::string_view name) {
 std::string_view NameOf(Integrator integrator) {
   return kIntegratorNames[static_cast<size_t>(integrator)];
 }
+
+absl::StatusOr<PixelFilter> PixelFilterFromName(std::string_view name) {
+  for (size_t i = 0; i < kFilterNames.size(); ++i) {
+    if (kFilterNames[i] == name) return static_cast<PixelFilter>(i);
+  }
+  return absl::InvalidArgumentError("unknown filter '" + std::string(name) +
+                                    "'; use box, triangle, gaussian or blackman-harris");
+}
+
+std::string_view NameOf(PixelFilter filter) { return kFilterNames[static_cast<size_t>(filter)]; }
 
 }  // namespace farpoint

@@ -17,10 +17,18 @@ enum class Integrator : uint32_t {
   kDpbgi,  // pbgi with a smaller microbuffer ("degraded", paper §4)
   kPt,     // path tracing over the triangles: the ground truth
 };
+
+// How the samples of a pixel are weighted. They are drawn from the filter's density about the
+// pixel's centre and counted alike ("filter importance sampling", Ernst et al. 2006), so a sample
+// belongs to one pixel and a tile needs nothing of its neighbours.
+enum class PixelFilter : uint32_t { kBox, kTriangle, kGaussian, kBlackmanHarris };
+
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
   uint32_t spp = 1;             // receivers per pixel, 1..256; 1: the pixel's centre
+  PixelFilter filter = PixelFilter::kBlackmanHarris;  // of no effect at spp 1
+  float filter_width_px = 0;  // of its whole support, 0.01..16; 0: the filter's default
   uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
   uint32_t light_samples = 32;  // shadow rays per receiver or surfel and light, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
@@ -41,6 +49,7 @@ struct RenderSettings {
   // The value in force where 0 means "default".
   uint32_t microbuffer_px() const;
   uint32_t clusters_per_block() const;
+  float filter_width() const;  // pixels
 };
 
 // kInvalidArgument names the setting, its value and what is allowed.
@@ -53,5 +62,8 @@ void ApplyPaperPreset(RenderSettings& settings);
 
 absl::StatusOr<Integrator> IntegratorFromName(std::string_view name);
 std::string_view NameOf(Integrator integrator);
+
+absl::StatusOr<PixelFilter> PixelFilterFromName(std::string_view name);
+std::string_view NameOf(PixelFilter filter);
 
 }  // namespace farpoint

@@ -89,8 +89,17 @@ struct Camera {
   double yfov_rad = 0.7;                                 // of the whole frame's height
 };
 
+// The radiance that arrives from a direction in which nothing lies: sky + map(direction).
+// The map is lat-long as OpenEXR lays it out (ImfEnvmap.h): row 0 is the map's up, +y; a direction
+// (x, y, z) of the map's frame has latitude asin(y), from pi/2 at the top edge to -pi/2 at the
+// bottom one, and longitude atan2(x, z), from +pi at the left edge to -pi at the right one, so that
+// the centre of the image is +z.
 struct Environment {
-  Rgb sky;  // constant radiance from all directions that leave the scene; zero: none
+  Rgb sky;  // constant; zero: none
+  uint32_t map_width = 0, map_height = 0;
+  std::vector<Rgb> map;  // row by row, map_width * map_height finite values >= 0; empty: none
+  // World directions of the map's x, y and z: orthonormal, right-handed.
+  std::array<Vec3d, 3> world_from_map{Vec3d{1, 0, 0}, Vec3d{0, 1, 0}, Vec3d{0, 0, 1}};
 };
 
 struct Scene {
