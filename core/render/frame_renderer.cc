@@ -17,6 +17,7 @@
 #include "core/render/camera_rays.h"
 #include "core/render/loaded_scene.h"
 #include "core/render/path_tracer.h"
+#include "core/render/pixel_filter.h"
 
 namespace farpoint {
 
@@ -75,7 +76,8 @@ class Renderer final : public FrameRenderer {
         frame_(frame),
         settings_(frame.settings),
         rays_(frame.camera, frame.film, scene_.scene->origin()),
-        map_(settings_.buffer_map, settings_.microbuffer_px()) {
+        map_(settings_.buffer_map, settings_.microbuffer_px()),
+        filter_(settings_.filter, settings_.filter_width()) {
     cut_params_.epsilon = settings_.epsilon;
     cut_params_.map = settings_.buffer_map;
     cut_params_.pixel_sr = map_.reference_solid_angle();
@@ -189,12 +191,14 @@ class Renderer final : public FrameRenderer {
     return finite;
   }
 
-  // Position of sample s of a pixel, in [0, 1)²; the centre if there is only one.
+  // Position of sample s of a pixel relative to its top left, by the filter; the centre if there
+  // is only one.
   Vec2f SamplePosition(int x, int y, uint32_t s) const {
     if (settings_.spp == 1) return {0.5f, 0.5f};
     const uint32_t seed = static_cast<uint32_t>(
         HashKey(settings_.seed, kKeyPixel, static_cast<uint64_t>(x), static_cast<uint64_t>(y)));
-    return {OwenSobol(s, 0, seed), OwenSobol(s, 1, seed)};
+    const Vec2f offset = filter_.Sample(OwenSobol(s, 0, seed), OwenSobol(s, 1, seed));
+    return {0.5f + offset.x, 0.5f + offset.y};
   }
 
   void TracePrimary(const PixelRect& block, std::vector<Sample>& samples,
@@ -391,7 +395,8 @@ class Renderer final : public FrameRenderer {
     n.skipped_hidden += raster_counters.hidden_pixels;
   }
 
-  // Samples to pixels, by a box filter. False if a value is not finite.
+  // Samples to pixels; they were drawn by the filter, so all count alike. False if a value is not
+  // finite.
   bool Develop(const PixelRect& block, const PixelRect& inside, const std::vector<Sample>& samples,
                const std::vector<Receiver>& receivers, Film& film) const {
     const uint32_t spp = settings_.spp;
@@ -524,6 +529,7 @@ class Renderer final : public FrameRenderer {
   RenderSettings settings_;
   CameraRays rays_;
   MicrobufferMap map_;
+  PixelFilterSampler filter_;
   CutParams cut_params_;
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
 };

@@ -26,9 +26,9 @@ enum class PixelFilter : uint32_t { kBox, kTriangle, kGaussian, kBlackmanHarris 
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
-  uint32_t spp = 1;             // receivers per pixel, 1..256; 1: the pixel's centre
+  uint32_t spp = 1;  // receivers per pixel, 1..256; 1: the pixel's centre
   PixelFilter filter = PixelFilter::kBlackmanHarris;  // of no effect at spp 1
-  float filter_width_px = 0;  // of its whole support, 0.01..16; 0: the filter's default
+  float filter_width_px = 0;    // of its whole support, 0.01..16; 0: the filter's default
   uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
   uint32_t light_samples = 32;  // shadow rays per receiver or surfel and light, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size

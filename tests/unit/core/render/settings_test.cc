@@ -85,6 +85,27 @@ TEST(RenderSettings, RealNumbersAreFiniteAndNotNegative) {
   }
 }
 
+TEST(RenderSettings, FiltersHaveAWidthOfTheirOwnOrTheUsers) {
+  RenderSettings s;
+  s.filter = PixelFilter::kBox;
+  EXPECT_EQ(s.filter_width(), 1.0f);
+  s.filter_width_px = 2.5f;
+  EXPECT_EQ(s.filter_width(), 2.5f);
+  for (const float v : {0.0f, 0.01f, 16.0f}) {
+    EXPECT_TRUE(Validated([&](RenderSettings& r) { r.filter_width_px = v; }).ok()) << v;
+  }
+  for (const float v : {-1.0f, 0.009f, 16.1f, std::numeric_limits<float>::quiet_NaN()}) {
+    ExpectRefused(Validated([&](RenderSettings& r) { r.filter_width_px = v; }),
+                  {"filter-width", "0.01", "16"});
+  }
+  for (const char* name : {"box", "triangle", "gaussian", "blackman-harris"}) {
+    const auto filter = PixelFilterFromName(name);
+    ASSERT_TRUE(filter.ok()) << filter.status();
+    EXPECT_EQ(NameOf(*filter), name);
+  }
+  ExpectRefused(PixelFilterFromName("lanczos").status(), {"lanczos", "blackman-harris"});
+}
+
 TEST(RenderSettings, TilesAreWholeBlocks) {
   for (const uint32_t v : {32u, 64u, 96u, 128u, 65536u}) {
     EXPECT_TRUE(Validated([&](RenderSettings& s) { s.tile_px = v; }).ok()) << v;
