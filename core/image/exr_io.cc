@@ -5,9 +5,11 @@
 #include <ImfChannelList.h>
 #include <ImfChromaticities.h>
 #include <ImfFrameBuffer.h>
+#include <ImfFramesPerSecond.h>
 #include <ImfHeader.h>
 #include <ImfIO.h>
 #include <ImfInputFile.h>
+#include <ImfIntAttribute.h>
 #include <ImfMatrixAttribute.h>
 #include <ImfOutputFile.h>
 #include <ImfStandardAttributes.h>
@@ -32,6 +34,25 @@ constexpr int64_t kMaxPixels = int64_t{1} << 30;
 constexpr int64_t kMaxValues = int64_t{1} << 33;
 constexpr int kMaxChannels = 1024;
 constexpr int kRowsPerWrite = 32;  // a multiple of every compressor's scanlines per chunk
+
+struct CompressionInfo {
+  ExrCompression compression;
+  std::string_view name;
+  Imf::Compression library_value;
+  bool lossless;
+};
+constexpr CompressionInfo kCompressions[] = {
+    {ExrCompression::kNone, "none", Imf::NO_COMPRESSION, true},
+    {ExrCompression::kRle, "rle", Imf::RLE_COMPRESSION, true},
+    {ExrCompression::kZips, "zips", Imf::ZIPS_COMPRESSION, true},
+    {ExrCompression::kZip, "zip", Imf::ZIP_COMPRESSION, true},
+    {ExrCompression::kPiz, "piz", Imf::PIZ_COMPRESSION, true},
+    {ExrCompression::kDwaa, "dwaa", Imf::DWAA_COMPRESSION, false},
+};
+
+const CompressionInfo& InfoOf(ExrCompression compression) {
+  return kCompressions[static_cast<size_t>(compression)];
+}
 
 class MemoryOutput final : public Imf::OStream {
  public:
@@ -210,7 +231,13 @@ absl::StatusOr<ExrImage> Read(const std::string& path, std::span<const std::byte
     } else if (const auto* m = dynamic_cast<const Imf::M44fAttribute*>(&it.attribute())) {
       std::array<float, 16>& values = image.metadata.matrices[it.name()];
       for (int i = 0; i < 16; ++i) values[static_cast<size_t>(i)] = m->value()[i / 4][i % 4];
+    } else if (const auto* number = dynamic_cast<const Imf::IntAttribute*>(&it.attribute())) {
+      image.metadata.ints[it.name()] = number->value();
     }
+  }
+  if (Imf::hasFramesPerSecond(header)) {
+    const Imf::Rational& rate = Imf::framesPerSecond(header);
+    if (rate.d != 0) image.metadata.frames_per_second = static_cast<double>(rate);
   }
   return image;
 }
@@ -221,9 +248,7 @@ void Write(MemoryOutput& stream, const Film& film, int frame_width, int frame_he
   const Imath::Box2i display({0, 0}, {frame_width - 1, frame_height - 1});
   const Imath::Box2i data({rect.x0, rect.y0}, {rect.x1 - 1, rect.y1 - 1});
   Imf::Header header(display, data, 1.0f, Imath::V2f(0, 0), 1.0f, Imf::INCREASING_Y,
-                     compression == ExrCompression::kNone  ? Imf::NO_COMPRESSION
-                     : compression == ExrCompression::kPiz ? Imf::PIZ_COMPRESSION
-                                                           : Imf::ZIP_COMPRESSION);
+                     InfoOf(compression).library_value);
   Imf::addChromaticities(header, Imf::Chromaticities());  // the default is Rec. 709, D65
   for (const auto& [name, text] : metadata.strings) {
     header.insert(name, Imf::StringAttribute(text));
@@ -232,6 +257,10 @@ void Write(MemoryOutput& stream, const Film& film, int frame_width, int frame_he
     Imath::M44f m;
     for (int i = 0; i < 16; ++i) m[i / 4][i % 4] = values[static_cast<size_t>(i)];
     header.insert(name, Imf::M44fAttribute(m));
+  }
+  for (const auto& [name, value] : metadata.ints) header.insert(name, Imf::IntAttribute(value));
+  if (metadata.frames_per_second) {
+    Imf::addFramesPerSecond(header, Imf::guessExactFps(*metadata.frames_per_second));
   }
 
   const size_t width = static_cast<size_t>(rect.width());
@@ -274,6 +303,19 @@ void Write(MemoryOutput& stream, const Film& film, int frame_width, int frame_he
 
 }  // namespace
 
+bool IsLossless(ExrCompression compression) { return InfoOf(compression).lossless; }
+
+std::string_view NameOf(ExrCompression compression) { return InfoOf(compression).name; }
+
+absl::StatusOr<ExrCompression> ExrCompressionFromName(std::string_view name) {
+  std::string known;
+  for (const CompressionInfo& info : kCompressions) {
+    if (name == info.name) return info.compression;
+    known.append(known.empty() ? "" : ", ").append(info.name);
+  }
+  return absl::InvalidArgumentError("expected one of " + known);
+}
+
 const ExrChannel* ExrImage::Find(const std::string& name) const {
   for (const ExrChannel& channel : channels) {
     if (channel.name == name) return &channel;
@@ -300,6 +342,11 @@ absl::Status WriteExr(const std::string& path, const Film& film, int frame_width
 }
 
 absl::StatusOr<ExrImage> ReadExr(const std::string& path) {
+  FP_ASSIGN_OR_RETURN(const Blob blob, Blob::MapFile(path));
+  return ReadExr(blob.bytes(), path);
+}
+
+absl::StatusOr<ExrImage> ReadExr(std::span<const std::byte> bytes, const std::string& name) {
   // Settings of the library, which is used in this file only.
   static const bool limited = [] {
     Imf::Header::setMaxImageSize(kMaxSide, kMaxSide);
@@ -307,14 +354,13 @@ absl::StatusOr<ExrImage> ReadExr(const std::string& path) {
     return true;
   }();
   static_cast<void>(limited);
-  FP_ASSIGN_OR_RETURN(const Blob blob, Blob::MapFile(path));
-  FP_RETURN_IF_ERROR(CheckHeaderSizes(path, blob.bytes()));
+  FP_RETURN_IF_ERROR(CheckHeaderSizes(name, bytes));
   try {
-    return Read(path, blob.bytes());
+    return Read(name, bytes);
   } catch (const std::bad_alloc&) {
-    return absl::ResourceExhaustedError("'" + path + "': not enough memory to decode the image");
+    return absl::ResourceExhaustedError("'" + name + "': not enough memory to decode the image");
   } catch (const std::exception& e) {
-    return Damaged(path, e.what());
+    return Damaged(name, e.what());
   }
 }
 

@@ -3,8 +3,13 @@
 #pragma once
 
 #include <array>
+#include <cstddef>
+#include <cstdint>
 #include <map>
+#include <optional>
+#include <span>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "core/base/status.h"
@@ -17,14 +22,26 @@ struct ExrMetadata {
   // worldToCamera, worldToNDC: row-major, as the file stores them. OpenEXR multiplies row vectors
   // from the left (p_camera = p_world * M), so the translation stands in elements 12 to 14.
   std::map<std::string, std::array<float, 16>> matrices;
+  std::map<std::string, int32_t> ints;
+  // framesPerSecond, the rate at which a sequence is played; stored as a fraction. The rates of
+  // film and television get their exact one: 23.976 is 24000/1001.
+  std::optional<double> frames_per_second;
 };
 
-enum class ExrCompression { kNone, kZip, kPiz };
+// As OpenEXR names them; zip is the usual choice, zips decodes single lines faster, piz is smaller
+// on noise. dwaa is lossy: half R, G, B are quantised at the library's default level, about a tenth
+// of zip's size; the other channels stay exact.
+enum class ExrCompression { kNone, kRle, kZips, kZip, kPiz, kDwaa };
+bool IsLossless(ExrCompression compression);
+std::string_view NameOf(ExrCompression compression);
+// kInvalidArgument lists the known names.
+absl::StatusOr<ExrCompression> ExrCompressionFromName(std::string_view name);
 
 // displayWindow: the whole frame; dataWindow: the film's rectangle (inclusive). Channels as in
 // layers.h, Rec. 709 chromaticities, scanlines from the top down. Halves and floats are stored as
-// Film::RoundToStorage() leaves them, bit by bit. Written to `path`.part, flushed, renamed.
-// kInvalidArgument for a film that leaves the frame or has no layer.
+// Film::RoundToStorage() leaves them, bit by bit unless the compression is lossy. Equal arguments
+// give equal bytes. Written to `path`.part, flushed, renamed. kInvalidArgument for a film that
+// leaves the frame or has no layer.
 absl::Status WriteExr(const std::string& path, const Film& film, int frame_width, int frame_height,
                       const ExrMetadata& metadata, ExrCompression compression);
 
@@ -46,6 +63,8 @@ struct ExrImage {
 // are refused as a whole. kInvalidArgument, kNotFound, kDataLoss or kResourceExhausted name the
 // file and the cause. Thread-safe.
 absl::StatusOr<ExrImage> ReadExr(const std::string& path);
+// The same from bytes; `name` is for messages.
+absl::StatusOr<ExrImage> ReadExr(std::span<const std::byte> bytes, const std::string& name);
 
 // The film that a file of ours holds: every known layer whose channels are all there.
 // kInvalidArgument if there is none, or if a channel is stored in another precision than ours.

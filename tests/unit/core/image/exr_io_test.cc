@@ -26,7 +26,9 @@ class ExrIo : public ImageFiles {
 
 TEST_F(ExrIo, RoundTripsEveryLayerAndCropBitByBit) {
   for (const ExrCompression compression :
-       {ExrCompression::kNone, ExrCompression::kZip, ExrCompression::kPiz}) {
+       {ExrCompression::kNone, ExrCompression::kRle, ExrCompression::kZips, ExrCompression::kZip,
+        ExrCompression::kPiz}) {
+    EXPECT_TRUE(IsLossless(compression));
     for (const PixelRect rect : {PixelRect{0, 0, 100, 70}, PixelRect{37, 5, 99, 70},
                                  PixelRect{99, 69, 100, 70}, PixelRect{0, 31, 100, 33}}) {
       const Film film = TestFilm(rect, EveryLayer());
@@ -44,6 +46,83 @@ TEST_F(ExrIo, RoundTripsEveryLayerAndCropBitByBit) {
       EXPECT_EQ(ImageHash(*back), ImageHash(film));
     }
   }
+}
+
+// Smooth colours, as images are.
+Film SmoothFilm() {
+  Film film({0, 0, 128, 96}, {Layer::kBeauty, Layer::kDepth});
+  for (int y = 0; y < 96; ++y) {
+    for (int x = 0; x < 128; ++x) {
+      const float u = static_cast<float>(x) / 128, v = static_cast<float>(y) / 96;
+      const float colour[4] = {0.1f + u, 0.2f + u * v, 0.5f + v * v, 1};
+      const float depth[1] = {1 + 7 * u + v};
+      film.Set(Layer::kBeauty, x, y, colour);
+      film.Set(Layer::kDepth, x, y, depth);
+    }
+  }
+  film.RoundToStorage();
+  return film;
+}
+
+TEST_F(ExrIo, LossyCompressionChangesColoursALittleAndNothingElse) {
+  EXPECT_FALSE(IsLossless(ExrCompression::kDwaa));
+  const Film film = SmoothFilm();
+  ASSERT_TRUE(WriteExr(Path("d.exr"), film, 128, 96, {}, ExrCompression::kDwaa).ok());
+  const absl::StatusOr<ExrImage> image = ReadExr(Path("d.exr"));
+  ASSERT_TRUE(image.ok()) << image.status();
+  const absl::StatusOr<Film> back = FilmFromExr(*image);
+  ASSERT_TRUE(back.ok()) << back.status();
+  EXPECT_NE(ImageHash(*back), ImageHash(film));
+  EXPECT_EQ(LayerHash(*back, Layer::kDepth), LayerHash(film, Layer::kDepth));
+  for (int c = 0; c < 4; ++c) {
+    const auto was = film.Plane(Layer::kBeauty, c), is = back->Plane(Layer::kBeauty, c);
+    for (size_t i = 0; i < was.size(); ++i) {
+      ASSERT_NEAR(is[i], was[i], c == 3 ? 0 : 0.02f) << "channel " << c << ", value " << i;
+    }
+  }
+}
+
+TEST_F(ExrIo, NamesOfCompressions) {
+  for (const char* name : {"none", "rle", "zips", "zip", "piz", "dwaa"}) {
+    const auto compression = ExrCompressionFromName(name);
+    ASSERT_TRUE(compression.ok()) << name;
+    EXPECT_EQ(NameOf(*compression), name);
+  }
+  const auto unknown = ExrCompressionFromName("lzw");
+  EXPECT_NE(unknown.status().message().find("none, rle, zips, zip, piz, dwaa"),
+            absl::string_view::npos);
+}
+
+TEST_F(ExrIo, KeepsNumbersAndTheFrameRateExactly) {
+  const Film film = TestFilm({0, 0, 4, 4}, {Layer::kBeauty});
+  ExrMetadata metadata;
+  metadata.ints["farpoint:frame"] = -7;
+  for (const double rate : {24.0, 24000.0 / 1001, 23.976, 29.97, 12.5, 1000.0, 0.1}) {
+    metadata.frames_per_second = rate;
+    ASSERT_TRUE(WriteExr(Path("f.exr"), film, 4, 4, metadata, ExrCompression::kZip).ok());
+    const absl::StatusOr<ExrImage> image = ReadExr(Path("f.exr"));
+    ASSERT_TRUE(image.ok()) << image.status();
+    EXPECT_EQ(image->metadata.ints.at("farpoint:frame"), -7);
+    ASSERT_TRUE(image->metadata.frames_per_second.has_value());
+    EXPECT_NEAR(*image->metadata.frames_per_second, rate, 1e-4 * rate);
+  }
+  metadata.frames_per_second = 23.976;
+  ASSERT_TRUE(WriteExr(Path("f.exr"), film, 4, 4, metadata, ExrCompression::kZip).ok());
+  EXPECT_EQ(*ReadExr(Path("f.exr"))->metadata.frames_per_second, 24000.0 / 1001);
+  metadata.frames_per_second.reset();
+  ASSERT_TRUE(WriteExr(Path("f.exr"), film, 4, 4, metadata, ExrCompression::kZip).ok());
+  EXPECT_FALSE(ReadExr(Path("f.exr"))->metadata.frames_per_second.has_value());
+}
+
+TEST_F(ExrIo, ReadsBytesAsItReadsFiles) {
+  const Film film = TestFilm({0, 0, 9, 7}, DefaultLayers());
+  ASSERT_TRUE(WriteExr(Path("f.exr"), film, 9, 7, {}, ExrCompression::kZip).ok());
+  const std::vector<std::byte> bytes = FileBytes("f.exr");
+  const absl::StatusOr<ExrImage> image = ReadExr(bytes, "env/sky.exr");
+  ASSERT_TRUE(image.ok()) << image.status();
+  EXPECT_TRUE(SameFilm(*FilmFromExr(*image), film));
+  const absl::Status cut = ReadExr(std::span(bytes).first(100), "env/sky.exr").status();
+  EXPECT_NE(cut.message().find("'env/sky.exr'"), absl::string_view::npos) << cut;
 }
 
 TEST_F(ExrIo, HashesOfUnroundedFilmsAreThoseOfTheirStoredValues) {
