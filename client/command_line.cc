@@ -476,7 +476,7 @@ absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
     if (parsed.config.empty()) break;
   }
 
-  auto level = LogLevelFromName(parsed.log_level);
+  auto level = ConsoleLevelFromName(parsed.log_level);
   FP_RETURN_IF_ERROR(Annotate(level.status(), "--log-level " + parsed.log_level));
   line.log_level = *level;
   line.farm_ignores = line.verb == Verb::kSubmit && (parsed.workers || parsed.threads);

@@ -19,7 +19,7 @@ struct CommandLine {
   // --help or --version: print this to stdout and be done; nothing else is set.
   std::optional<std::string> print;
 
-  LogLevel log_level = LogLevel::kInfo;
+  ConsoleLevel log_level = ConsoleLevel::kInfo;
   bool quiet = false;
   std::string json;         // file for statistics or status; "-": stdout; empty: none
   std::string coordinator;  // HOST:PORT

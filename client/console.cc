@@ -5,12 +5,12 @@
 
 namespace farpoint {
 
-absl::StatusOr<LogLevel> LogLevelFromName(std::string_view name) {
-  constexpr std::pair<std::string_view, LogLevel> kLevels[] = {{"debug", LogLevel::kDebug},
-                                                               {"info", LogLevel::kInfo},
-                                                               {"warn", LogLevel::kWarn},
-                                                               {"error", LogLevel::kError},
-                                                               {"off", LogLevel::kOff}};
+absl::StatusOr<ConsoleLevel> ConsoleLevelFromName(std::string_view name) {
+  constexpr std::pair<std::string_view, ConsoleLevel> kLevels[] = {{"debug", ConsoleLevel::kDebug},
+                                                                   {"info", ConsoleLevel::kInfo},
+                                                                   {"warn", ConsoleLevel::kWarn},
+                                                                   {"error", ConsoleLevel::kError},
+                                                                   {"off", ConsoleLevel::kOff}};
   for (const auto& [known, level] : kLevels) {
     if (name == known) return level;
   }
@@ -49,7 +49,7 @@ std::string ProgressText(const JobStatus& status, int columns) {
   return bar;
 }
 
-Console::Console(std::FILE* stream, bool terminal, LogLevel level, bool quiet)
+Console::Console(std::FILE* stream, bool terminal, ConsoleLevel level, bool quiet)
     : stream_(stream), terminal_(terminal), level_(level), quiet_(quiet) {}
 
 Console::~Console() { EraseBar(); }
@@ -59,8 +59,8 @@ void Console::EraseBar() {
   bar_drawn_ = false;
 }
 
-void Console::Write(LogLevel level, std::string_view prefix, std::string_view text) {
-  if (level < level_ || (quiet_ && level < LogLevel::kWarn)) return;
+void Console::Write(ConsoleLevel level, std::string_view prefix, std::string_view text) {
+  if (level < level_ || (quiet_ && level < ConsoleLevel::kWarn)) return;
   std::lock_guard lock(mutex_);
   EraseBar();
   // In one call, so that lines of several processes stay whole.
@@ -70,7 +70,7 @@ void Console::Write(LogLevel level, std::string_view prefix, std::string_view te
 }
 
 void Console::Progress(const JobStatus& status) {
-  if (quiet_ || level_ > LogLevel::kInfo) return;
+  if (quiet_ || level_ > ConsoleLevel::kInfo) return;
   std::lock_guard lock(mutex_);
   if (terminal_) {
     std::string line = "\r";

@@ -12,9 +12,9 @@
 
 namespace farpoint {
 
-enum class LogLevel { kDebug, kInfo, kWarn, kError, kOff };
+enum class ConsoleLevel { kDebug, kInfo, kWarn, kError, kOff };
 // kInvalidArgument lists the known names.
-absl::StatusOr<LogLevel> LogLevelFromName(std::string_view name);
+absl::StatusOr<ConsoleLevel> ConsoleLevelFromName(std::string_view name);
 
 // "[#########-----------]  45 %  12/27 tiles  eta 1:05"; `columns` >= 20.
 std::string ProgressText(const JobStatus& status, int columns);
@@ -24,23 +24,23 @@ std::string DurationText(double seconds);
 class Console {
  public:
   // Without progress if `quiet`. `stream` must live as long as this.
-  Console(std::FILE* stream, bool terminal, LogLevel level, bool quiet);
+  Console(std::FILE* stream, bool terminal, ConsoleLevel level, bool quiet);
   ~Console();
 
-  void Debug(std::string_view text) { Write(LogLevel::kDebug, "", text); }
-  void Info(std::string_view text) { Write(LogLevel::kInfo, "", text); }
-  void Warn(std::string_view text) { Write(LogLevel::kWarn, "warning: ", text); }
-  void Error(std::string_view text) { Write(LogLevel::kError, "error: ", text); }
+  void Debug(std::string_view text) { Write(ConsoleLevel::kDebug, "", text); }
+  void Info(std::string_view text) { Write(ConsoleLevel::kInfo, "", text); }
+  void Warn(std::string_view text) { Write(ConsoleLevel::kWarn, "warning: ", text); }
+  void Error(std::string_view text) { Write(ConsoleLevel::kError, "error: ", text); }
 
   void Progress(const JobStatus& status);
 
  private:
-  void Write(LogLevel level, std::string_view prefix, std::string_view text);
+  void Write(ConsoleLevel level, std::string_view prefix, std::string_view text);
   void EraseBar();
 
   std::FILE* const stream_;
   const bool terminal_;
-  const LogLevel level_;
+  const ConsoleLevel level_;
   const bool quiet_;
   std::mutex mutex_;
   bool bar_drawn_ = false;   // guarded by mutex_

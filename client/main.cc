@@ -19,7 +19,8 @@ int main(int argc, char** argv) {
   const bool terminal = isatty(STDERR_FILENO) != 0;
   auto line = ParseCommandLine(args, coordinator == nullptr ? "" : coordinator);
   if (!line.ok()) {
-    Console(stderr, terminal, LogLevel::kError, true).Error(std::string(line.status().message()));
+    Console(stderr, terminal, ConsoleLevel::kError, true)
+        .Error(std::string(line.status().message()));
     return kExitUsage;
   }
   if (line->print) {

@@ -40,7 +40,7 @@ TEST(CommandLine, Render) {
   EXPECT_EQ(line.json, "s.json");
   EXPECT_EQ(line.png, "p.png");
   EXPECT_TRUE(line.quiet);
-  EXPECT_EQ(line.log_level, LogLevel::kDebug);
+  EXPECT_EQ(line.log_level, ConsoleLevel::kDebug);
   EXPECT_EQ(line.exposure_stops, -1.5f);
   EXPECT_TRUE(line.render_flags.empty());
 }

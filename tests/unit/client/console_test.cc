@@ -41,7 +41,7 @@ JobStatus Rendering(uint32_t committed, uint32_t total) {
 
 TEST(Console, PutsItsNameInFrontOfEachLine) {
   Capture capture;
-  Console console(capture.file(), false, LogLevel::kInfo, false);
+  Console console(capture.file(), false, ConsoleLevel::kInfo, false);
   console.Error("film is empty");
   console.Warn("slow");
   console.Info("job 1");
@@ -52,7 +52,7 @@ TEST(Console, PutsItsNameInFrontOfEachLine) {
 
 TEST(Console, ShowsOnlyWhatItsLevelLetsThrough) {
   Capture capture;
-  Console console(capture.file(), false, LogLevel::kError, false);
+  Console console(capture.file(), false, ConsoleLevel::kError, false);
   console.Debug("a");
   console.Info("b");
   console.Warn("c");
@@ -63,7 +63,7 @@ TEST(Console, ShowsOnlyWhatItsLevelLetsThrough) {
 
 TEST(Console, IsQuietButForWarningsAndErrors) {
   Capture capture;
-  Console console(capture.file(), true, LogLevel::kDebug, true);
+  Console console(capture.file(), true, ConsoleLevel::kDebug, true);
   console.Info("a");
   console.Progress(Rendering(1, 2));
   console.Warn("b");
@@ -72,7 +72,7 @@ TEST(Console, IsQuietButForWarningsAndErrors) {
 
 TEST(Console, WritesALinePerTenthWhereThereIsNoTerminal) {
   Capture capture;
-  Console console(capture.file(), false, LogLevel::kInfo, false);
+  Console console(capture.file(), false, ConsoleLevel::kInfo, false);
   for (uint32_t i = 0; i <= 100; ++i) console.Progress(Rendering(i, 100));
   const std::string text = capture.Text();
   EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 11) << text;
@@ -82,7 +82,7 @@ TEST(Console, WritesALinePerTenthWhereThereIsNoTerminal) {
 
 TEST(Console, RedrawsOneLineOnATerminal) {
   Capture capture;
-  Console console(capture.file(), true, LogLevel::kInfo, false);
+  Console console(capture.file(), true, ConsoleLevel::kInfo, false);
   for (uint32_t i = 0; i <= 10; ++i) console.Progress(Rendering(i, 10));
   const std::string text = capture.Text();
   EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 0);
@@ -91,7 +91,7 @@ TEST(Console, RedrawsOneLineOnATerminal) {
 
 TEST(Console, ClearsTheBarBeforeAMessage) {
   Capture capture;
-  Console console(capture.file(), true, LogLevel::kInfo, false);
+  Console console(capture.file(), true, ConsoleLevel::kInfo, false);
   console.Progress(Rendering(1, 10));
   console.Info("note");
   const std::string text = capture.Text();
@@ -133,10 +133,10 @@ TEST(DurationText, GroupsSeconds) {
   EXPECT_EQ(DurationText(-3), "0:00");
 }
 
-TEST(LogLevelFromName, KnowsItsNamesOnly) {
-  EXPECT_EQ(*LogLevelFromName("debug"), LogLevel::kDebug);
-  EXPECT_EQ(*LogLevelFromName("off"), LogLevel::kOff);
-  EXPECT_FALSE(LogLevelFromName("loud").ok());
+TEST(ConsoleLevelFromName, KnowsItsNamesOnly) {
+  EXPECT_EQ(*ConsoleLevelFromName("debug"), ConsoleLevel::kDebug);
+  EXPECT_EQ(*ConsoleLevelFromName("off"), ConsoleLevel::kOff);
+  EXPECT_FALSE(ConsoleLevelFromName("loud").ok());
 }
 
 }  // namespace

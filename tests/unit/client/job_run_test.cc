@@ -122,7 +122,7 @@ class JobRunTest : public testing::Test {
   }
 
   StopFlag stop_;
-  Console console_{stderr, false, LogLevel::kOff, true};
+  Console console_{stderr, false, ConsoleLevel::kOff, true};
   FakeFarm farm_{stop_};
   Retry retry_{{.first_wait = milliseconds(1),
                 .longest_wait = milliseconds(1),

@@ -17,7 +17,7 @@ class RetryTest : public testing::Test {
         "coordinator test:1", stop_, console_);
   }
   StopFlag stop_;
-  Console console_{stderr, false, LogLevel::kOff, true};
+  Console console_{stderr, false, ConsoleLevel::kOff, true};
 };
 
 TEST_F(RetryTest, TriesAgainUntilTheCoordinatorIsBack) {
