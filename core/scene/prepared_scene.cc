@@ -196,6 +196,9 @@ class Builder {
     return Serialize();
   }
 
+  // By object, after Build.
+  std::vector<uint32_t> TakeObjectInstances() { return std::move(object_instances_); }
+
  private:
   const Mesh& MeshOf(const Instance& instance) const { return scene_.meshes[instance.mesh]; }
 
@@ -494,6 +497,7 @@ class Builder {
     objects_.push_back({first_triangle, triangles_.size() - first_triangle, material,
                         mesh.normals.empty() ? 0u : 1u,
                         ContentKey(geometry_key, instance.world_from_mesh)});
+    object_instances_.push_back(static_cast<uint32_t>(instance_index));
     return absl::OkStatus();
   }
 
@@ -647,6 +651,7 @@ class Builder {
   std::array<std::vector<Vec2f>, 2> uv_;
   std::vector<PreparedTriangle> triangles_;
   std::vector<PreparedObject> objects_;
+  std::vector<uint32_t> object_instances_;
   std::vector<PreparedMaterial> materials_;
   std::vector<PreparedTexture> textures_;
   std::vector<uint32_t> texels_;
@@ -657,13 +662,20 @@ class Builder {
 
 absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Prepare(const Scene& scene,
                                                                             Executor& executor) {
-  FP_ASSIGN_OR_RETURN(Blob blob, Builder(scene, executor).Build());
-  return FromBlob(std::move(blob));
+  Builder builder(scene, executor);
+  FP_ASSIGN_OR_RETURN(Blob blob, builder.Build());
+  return Make(std::move(blob), builder.TakeObjectInstances());
 }
 
 absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::FromBlob(Blob blob) {
+  return Make(std::move(blob), {});
+}
+
+absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Make(
+    Blob blob, std::vector<uint32_t> object_instances) {
   std::shared_ptr<PreparedScene> scene(new PreparedScene());
   scene->blob_ = std::move(blob);
+  scene->object_instances_ = std::move(object_instances);
   if (const absl::Status status = scene->Read(); !status.ok()) {
     return Annotate(status, "prepared scene");
   }

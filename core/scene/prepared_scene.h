@@ -107,6 +107,10 @@ class PreparedScene {
   bool has_alpha_masks() const { return has_alpha_masks_; }
   // Triangles that Prepare left out because they are degenerate.
   uint64_t dropped_triangles() const { return dropped_triangles_; }
+  // By object: the index of the instance that it was made of, in the Scene given to Prepare. The
+  // vertices of that instance's mesh, in their order, follow those of the object before. Empty if
+  // the scene was read from a blob.
+  std::span<const uint32_t> object_instances() const { return object_instances_; }
   // Triangles whose material emits (emission > 0 in some channel), ascending.
   std::span<const uint32_t> emissive_triangles() const { return emissive_triangles_; }
 
@@ -128,6 +132,8 @@ class PreparedScene {
 
  private:
   PreparedScene() = default;
+  static absl::StatusOr<std::shared_ptr<const PreparedScene>> Make(
+      Blob blob, std::vector<uint32_t> object_instances);
   absl::Status Read();
   absl::Status CheckTables() const;
   absl::Status CheckGeometry();
@@ -146,6 +152,7 @@ class PreparedScene {
   std::span<const uint32_t> texels_;  // RGBA8, sRGB-encoded colour, linear alpha, R lowest byte
   std::span<const PreparedLight> lights_;
   std::vector<uint32_t> emissive_triangles_;
+  std::vector<uint32_t> object_instances_;
   Rgb sky_;
   bool has_alpha_masks_ = false;
   uint64_t dropped_triangles_ = 0;
