@@ -4,6 +4,7 @@
 #include <ImathMatrix.h>
 #include <ImfChannelList.h>
 #include <ImfChromaticities.h>
+#include <ImfEnvmap.h>
 #include <ImfFrameBuffer.h>
 #include <ImfFramesPerSecond.h>
 #include <ImfHeader.h>
@@ -154,6 +155,16 @@ absl::Status CheckHeaderSizes(const std::string& path, std::span<const std::byte
   }
 }
 
+// Settings of the library, which is used in this file only.
+void LimitLibrary() {
+  static const bool limited = [] {
+    Imf::Header::setMaxImageSize(kMaxSide, kMaxSide);
+    Imf::Header::setMaxTileSize(4096, 4096);
+    return true;
+  }();
+  static_cast<void>(limited);
+}
+
 // A bound on how much a chunk can grow when it is decompressed; 0: none is known.
 int64_t MaxExpansion(Imf::Compression compression) {
   switch (compression) {
@@ -238,6 +249,99 @@ absl::StatusOr<ExrImage> Read(const std::string& path, std::span<const std::byte
   if (Imf::hasFramesPerSecond(header)) {
     const Imf::Rational& rate = Imf::framesPerSecond(header);
     if (rate.d != 0) image.metadata.frames_per_second = static_cast<double>(rate);
+  }
+  return image;
+}
+
+// Columns of the matrix from the file's RGB to Rec. 709, white to white; the identity if the file
+// does not say what its primaries are.
+std::array<Vec3f, 3> Rec709FromFile(const Imf::Header& header) {
+  std::array<Vec3f, 3> columns{Vec3f(1, 0, 0), Vec3f(0, 1, 0), Vec3f(0, 0, 1)};
+  if (!Imf::hasChromaticities(header)) return columns;
+  const Imf::Chromaticities& file = Imf::chromaticities(header);
+  const Imf::Chromaticities rec709;
+  if (file == rec709) return columns;
+  // Row vectors are multiplied from the left.
+  const Imath::M44f m = Imf::RGBtoXYZ(file, 1.0f) * Imf::XYZtoRGB(rec709, 1.0f);
+  const Imath::V3f white = Imath::V3f(1.0f, 1.0f, 1.0f) * m;
+  for (int from = 0; from < 3; ++from) {
+    for (int to = 0; to < 3; ++to) {
+      columns[static_cast<size_t>(from)][to] = m[from][to] / white[to];
+    }
+  }
+  return columns;
+}
+
+absl::StatusOr<ExrRgbImage> ReadRgb(std::span<const std::byte> bytes, const std::string& name,
+                                    int64_t max_pixels) {
+  MemoryInput stream(bytes);
+  Imf::InputFile file(stream, 0);
+  const Imf::Header& header = file.header();
+  const Imath::Box2i data = header.dataWindow();
+  const int64_t width = int64_t{data.max.x} - data.min.x + 1;
+  const int64_t height = int64_t{data.max.y} - data.min.y + 1;
+  if (width < 1 || height < 1 || width > kMaxSide || height > kMaxSide ||
+      width * height > max_pixels) {
+    return absl::InvalidArgumentError("'" + name + "': " + std::to_string(width) + "x" +
+                                      std::to_string(height) +
+                                      " pixels; from 1x1 up to 65536 on a side and " +
+                                      std::to_string(max_pixels) + " in all can be read");
+  }
+  const bool grey = header.channels().findChannel("Y") != nullptr &&
+                    header.channels().findChannel("R") == nullptr;
+  int64_t stored_bytes_per_pixel = 0;
+  for (auto it = header.channels().begin(); it != header.channels().end(); ++it) {
+    stored_bytes_per_pixel += it.channel().type == Imf::HALF ? 2 : 4;
+  }
+  for (const char* channel : {"R", "G", "B"}) {
+    const Imf::Channel* found = header.channels().findChannel(grey ? "Y" : channel);
+    if (found == nullptr) {
+      return absl::InvalidArgumentError("'" + name + "' has no channel " + channel +
+                                        " and no Y; write R, G and B, or Y alone");
+    }
+    if (found->xSampling != 1 || found->ySampling != 1 || found->type == Imf::UINT) {
+      return absl::InvalidArgumentError("'" + name + "': channel " + (grey ? "Y" : channel) +
+                                        " is subsampled or holds integers; write it as half or "
+                                        "float at full resolution");
+    }
+  }
+  if (grey && (header.channels().findChannel("RY") != nullptr ||
+               header.channels().findChannel("BY") != nullptr)) {
+    return absl::InvalidArgumentError("'" + name +
+                                      "' stores luminance and chroma; write R, G and B");
+  }
+  const int64_t expansion = MaxExpansion(header.compression());
+  const int64_t pixel_bytes = width * height * stored_bytes_per_pixel;
+  if (expansion > 0 && pixel_bytes / expansion > static_cast<int64_t>(bytes.size())) {
+    return Damaged(name, std::to_string(bytes.size()) + " bytes cannot hold " +
+                             std::to_string(pixel_bytes) + " bytes of pixels");
+  }
+  if (!file.isComplete()) return Damaged(name, "pixels are missing");
+
+  ExrRgbImage image;
+  image.width = static_cast<uint32_t>(width);
+  image.height = static_cast<uint32_t>(height);
+  image.cube_map = Imf::hasEnvmap(header) && Imf::envmap(header) == Imf::ENVMAP_CUBE;
+  image.pixels.resize(static_cast<size_t>(width * height));
+  const auto slice = [&](float& first) {
+    return Imf::Slice::Make(Imf::FLOAT, &first, data, sizeof(Rgb),
+                            sizeof(Rgb) * static_cast<size_t>(width));
+  };
+  Imf::FrameBuffer target;
+  target.insert(grey ? "Y" : "R", slice(image.pixels[0].x));
+  if (!grey) {
+    target.insert("G", slice(image.pixels[0].y));
+    target.insert("B", slice(image.pixels[0].z));
+  }
+  file.setFrameBuffer(target);
+  file.readPixels(data.min.y, data.max.y);
+  if (grey) {
+    for (Rgb& pixel : image.pixels) pixel = Rgb(pixel.x);
+    return image;
+  }
+  const std::array<Vec3f, 3> m = Rec709FromFile(header);
+  if (m[0] != Vec3f(1, 0, 0) || m[1] != Vec3f(0, 1, 0) || m[2] != Vec3f(0, 0, 1)) {
+    for (Rgb& p : image.pixels) p = m[0] * p.x + m[1] * p.y + m[2] * p.z;
   }
   return image;
 }
@@ -347,16 +451,23 @@ absl::StatusOr<ExrImage> ReadExr(const std::string& path) {
 }
 
 absl::StatusOr<ExrImage> ReadExr(std::span<const std::byte> bytes, const std::string& name) {
-  // Settings of the library, which is used in this file only.
-  static const bool limited = [] {
-    Imf::Header::setMaxImageSize(kMaxSide, kMaxSide);
-    Imf::Header::setMaxTileSize(4096, 4096);
-    return true;
-  }();
-  static_cast<void>(limited);
+  LimitLibrary();
   FP_RETURN_IF_ERROR(CheckHeaderSizes(name, bytes));
   try {
     return Read(name, bytes);
+  } catch (const std::bad_alloc&) {
+    return absl::ResourceExhaustedError("'" + name + "': not enough memory to decode the image");
+  } catch (const std::exception& e) {
+    return Damaged(name, e.what());
+  }
+}
+
+absl::StatusOr<ExrRgbImage> ReadExrRgb(std::span<const std::byte> bytes, const std::string& name,
+                                       int64_t max_pixels) {
+  LimitLibrary();
+  FP_RETURN_IF_ERROR(CheckHeaderSizes(name, bytes));
+  try {
+    return ReadRgb(bytes, name, max_pixels);
   } catch (const std::bad_alloc&) {
     return absl::ResourceExhaustedError("'" + name + "': not enough memory to decode the image");
   } catch (const std::exception& e) {

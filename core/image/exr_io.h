@@ -14,6 +14,7 @@
 
 #include "core/base/status.h"
 #include "core/image/film.h"
+#include "core/math/vec.h"
 
 namespace farpoint {
 
@@ -65,6 +66,18 @@ struct ExrImage {
 absl::StatusOr<ExrImage> ReadExr(const std::string& path);
 // The same from bytes; `name` is for messages.
 absl::StatusOr<ExrImage> ReadExr(std::span<const std::byte> bytes, const std::string& name);
+
+// The colours of a file, whatever its windows.
+struct ExrRgbImage {
+  uint32_t width = 0, height = 0;  // of the dataWindow
+  std::vector<Rgb> pixels;         // rows from the top, as in the file: of any sign, maybe NaN
+  bool cube_map = false;           // the attribute `envmap` says so
+};
+// R, G and B, half or float, converted to Rec. 709 if the file names other primaries (its white
+// stays white), or Y alone. The size is checked against `max_pixels` before anything is allocated.
+// kInvalidArgument, kDataLoss or kResourceExhausted name the file and the cause. Thread-safe.
+absl::StatusOr<ExrRgbImage> ReadExrRgb(std::span<const std::byte> bytes, const std::string& name,
+                                       int64_t max_pixels);
 
 // The film that a file of ours holds: every known layer whose channels are all there.
 // kInvalidArgument if there is none, or if a channel is stored in another precision than ours.
