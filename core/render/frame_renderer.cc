@@ -215,7 +215,10 @@ class Renderer final : public FrameRenderer {
           ++n.rays;
           const std::optional<RayHit> hit = scene_.accel->Intersect(rays_.eye(), w);
           Sample& sample = samples[at];
-          if (!hit) continue;
+          if (!hit) {
+            sample.emission = scene.EnvironmentRadiance(w);
+            continue;
+          }
           const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
           sample.hit = true;
           sample.albedo = surface.albedo;
@@ -401,7 +404,6 @@ class Renderer final : public FrameRenderer {
                const std::vector<Receiver>& receivers, Film& film) const {
     const uint32_t spp = settings_.spp;
     const float inverse_spp = 1.0f / static_cast<float>(spp);
-    const Rgb sky = scene_.scene->sky();
     const Vec3d origin = scene_.scene->origin();
     bool finite = true;
     for (int y = inside.y0; y < inside.y1; ++y) {
@@ -418,7 +420,7 @@ class Renderer final : public FrameRenderer {
         for (uint32_t s = 0; s < spp; ++s) {
           const Sample& sample = samples[first + s];
           if (!sample.hit) {
-            emission += sky;
+            emission += sample.emission;
             continue;
           }
           ++hits;

@@ -26,6 +26,9 @@ Box3d WorldBounds(const Scene& scene) {
 
 bool IsLit(const Scene& scene) {
   if (MaxComponent(scene.environment.sky) > 0) return true;
+  for (const Rgb& texel : scene.environment.map) {
+    if (MaxComponent(texel) > 0) return true;
+  }
   for (const PunctualLight& light : scene.lights) {
     if (MaxComponent(light.intensity) > 0) return true;
   }

@@ -19,7 +19,7 @@ namespace farpoint {
 namespace {
 
 constexpr uint64_t kMagic = 0x454e454353504600;  // "\0FPSCENE"
-constexpr uint32_t kVersion = 1;
+constexpr uint32_t kVersion = 2;
 
 // Squares of lengths up to 2^62 are floats, and so are areas down to 2^-120.
 constexpr double kMaxExtentM = 0x1p60;
@@ -31,6 +31,7 @@ constexpr double kMinSliverRatio = 0x1p-44;
 constexpr float kMaxRadiance = 1e15f;
 constexpr float kMaxUvFactor = 1e10f;
 constexpr uint64_t kMaxTexels = uint64_t{1} << 30;
+constexpr uint64_t kMaxMapTexels = uint64_t{1} << 26;
 constexpr uint64_t kMaxElements = std::numeric_limits<uint32_t>::max();
 constexpr size_t kPiece = 1 << 14;
 
@@ -173,6 +174,14 @@ bool InRange(const Rgb& c, float max) {
   return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= max && c.y <= max && c.z <= max;
 }
 
+bool IsRotation(const std::array<Vec3d, 3>& axes) {
+  const auto near = [](double a, double b) { return std::fabs(a - b) < 1e-6; };
+  return near(Length2(axes[0]), 1) && near(Length2(axes[1]), 1) && near(Dot(axes[0], axes[1]), 0) &&
+         MaxAbs(Cross(axes[0], axes[1]) - axes[2]) < 1e-6;
+}
+
+bool IsHalf(float f) { return HalfToFloat(FloatToHalf(f)) == f; }
+
 bool UsesTexture(const PreparedMaterial& m) {
   return m.base_color_texture >= 0 || m.emission_texture >= 0;
 }
@@ -193,6 +202,7 @@ class Builder {
     FP_RETURN_IF_ERROR(BuildMaterials());
     for (size_t i = 0; i < scene_.instances.size(); ++i) FP_RETURN_IF_ERROR(Flatten(i));
     FP_RETURN_IF_ERROR(BuildLights());
+    FP_RETURN_IF_ERROR(BuildEnvironment());
     return Serialize();
   }
 
@@ -615,13 +625,71 @@ class Builder {
     return absl::OkStatus();
   }
 
+  absl::Status BuildEnvironment() {
+    const Environment& source = scene_.environment;
+    const auto fail = [](const std::string& text) {
+      return absl::InvalidArgumentError("environment: " + text);
+    };
+    if (!InRange(source.sky, kMaxRadiance)) {
+      return fail("the sky's radiance is outside of [0, 1e15] W/(m² sr); correct it");
+    }
+    sky_ = source.sky;
+    if (source.map.empty()) return absl::OkStatus();
+    const uint64_t count = uint64_t{source.map_width} * source.map_height;
+    if (source.map_width == 0 || source.map_height == 0 || count != source.map.size()) {
+      return fail("the map has " + std::to_string(source.map.size()) + " texels for " +
+                  std::to_string(source.map_width) + " x " + std::to_string(source.map_height));
+    }
+    if (count > kMaxMapTexels) {
+      return absl::ResourceExhaustedError("environment: the map has " + std::to_string(count) +
+                                          " texels, more than 2^26; make it smaller");
+    }
+    if (!IsRotation(source.world_from_map)) {
+      return fail("the map's axes are not orthonormal and right-handed; correct its orientation");
+    }
+    bool constant = true, halves = true;
+    for (size_t i = 0; i < source.map.size(); ++i) {
+      const Rgb& texel = source.map[i];
+      if (!InRange(texel, kMaxRadiance)) {
+        return fail("texel (" + std::to_string(i % source.map_width) + ", " +
+                    std::to_string(i / source.map_width) +
+                    ") of the map is outside of [0, 1e15] W/(m² sr); correct it");
+      }
+      constant = constant && texel == source.map[0];
+      halves = halves && IsHalf(texel.x) && IsHalf(texel.y) && IsHalf(texel.z);
+    }
+    if (constant) {
+      sky_ += source.map[0];
+      return InRange(sky_, kMaxRadiance)
+                 ? absl::OkStatus()
+                 : fail("sky and map together exceed 1e15 W/(m² sr); lower them");
+    }
+    map_width_ = source.map_width;
+    map_height_ = source.map_height;
+    world_from_map_ = source.world_from_map;
+    // Halves where they lose nothing, as in maps that were stored so.
+    for (const Rgb& texel : source.map) {
+      for (int c = 0; c < 3; ++c) {
+        if (halves) {
+          map_halves_.push_back(FloatToHalf(texel[c]));
+        } else {
+          map_floats_.push_back(texel[c]);
+        }
+      }
+    }
+    return absl::OkStatus();
+  }
+
   Blob Serialize() {
     ByteWriter w;
     w.Put(kMagic);
     w.Put(kVersion);
     w.Put(uint32_t{0});
     w.Put(origin_);
-    w.Put(scene_.environment.sky);
+    w.Put(sky_);
+    w.Put(map_width_);
+    w.Put(map_height_);
+    w.Put(world_from_map_);
     w.Put(dropped_);
     w.PutArray(std::span<const Vec3f>(vertices_));
     w.PutArray(std::span<const Vec3f>(normals_));
@@ -632,6 +700,8 @@ class Builder {
     w.PutArray(std::span<const PreparedTexture>(textures_));
     w.PutArray(std::span<const PreparedLight>(lights_));
     w.PutArray(std::span<const uint32_t>(texels_));
+    w.PutArray(std::span<const uint16_t>(map_halves_));
+    w.PutArray(std::span<const float>(map_floats_));
     return w.TakeBlob();
   }
 
@@ -656,6 +726,11 @@ class Builder {
   std::vector<PreparedTexture> textures_;
   std::vector<uint32_t> texels_;
   std::vector<PreparedLight> lights_;
+  Rgb sky_;
+  uint32_t map_width_ = 0, map_height_ = 0;
+  std::array<Vec3d, 3> world_from_map_ = Environment().world_from_map;
+  std::vector<uint16_t> map_halves_;
+  std::vector<float> map_floats_;
 };
 
 }  // namespace
@@ -699,6 +774,9 @@ absl::Status PreparedScene::Read() {
   FP_RETURN_IF_ERROR(r.Get(reserved, "reserved"));
   FP_RETURN_IF_ERROR(r.Get(origin_, "origin"));
   FP_RETURN_IF_ERROR(r.Get(sky_, "sky"));
+  FP_RETURN_IF_ERROR(r.Get(map_width_, "map_width"));
+  FP_RETURN_IF_ERROR(r.Get(map_height_, "map_height"));
+  FP_RETURN_IF_ERROR(r.Get(world_from_map_, "world_from_map"));
   FP_RETURN_IF_ERROR(r.Get(dropped_triangles_, "dropped_triangles"));
   FP_RETURN_IF_ERROR(r.GetArray(vertices_, "vertices"));
   FP_RETURN_IF_ERROR(r.GetArray(normals_, "normals"));
@@ -710,12 +788,28 @@ absl::Status PreparedScene::Read() {
   FP_RETURN_IF_ERROR(r.GetArray(textures_, "textures"));
   FP_RETURN_IF_ERROR(r.GetArray(lights_, "lights"));
   FP_RETURN_IF_ERROR(r.GetArray(texels_, "texels"));
+  FP_RETURN_IF_ERROR(r.GetArray(map_halves_, "map_halves"));
+  FP_RETURN_IF_ERROR(r.GetArray(map_floats_, "map_floats"));
   return r.ExpectEnd();
 }
 
 absl::Status PreparedScene::CheckTables() const {
   if (!IsFinite(origin_)) return BadBlob("the origin is not finite");
   if (!InRange(sky_, kMaxRadiance)) return BadBlob("the sky's radiance is out of range");
+  const uint64_t map_texels = uint64_t{map_width_} * map_height_;
+  if ((map_width_ == 0) != (map_height_ == 0) || map_texels > kMaxMapTexels ||
+      map_halves_.size() + map_floats_.size() != 3 * map_texels ||
+      (!map_halves_.empty() && !map_floats_.empty()) || !IsRotation(world_from_map_)) {
+    return BadBlob("the environment map has a value out of range");
+  }
+  for (uint32_t y = 0; y < map_height_; ++y) {
+    for (uint32_t x = 0; x < map_width_; ++x) {
+      if (!InRange(MapTexel(x, y), kMaxRadiance)) {
+        return BadBlob("texel (" + std::to_string(x) + ", " + std::to_string(y) +
+                       ") of the environment map is out of range");
+      }
+    }
+  }
   if (normals_.size() != vertices_.size() || vertices_.size() > kMaxElements ||
       triangles_.size() > kMaxElements) {
     return BadBlob("the numbers of vertices, normals and triangles do not fit");
@@ -895,6 +989,121 @@ SurfaceSample PreparedScene::Surface(uint32_t triangle, float b1, float b2) cons
     sample.emission = m.emission * SampleTexture(m.emission_texture, uv, nullptr);
   }
   return sample;
+}
+
+std::array<Vec2f, 3> PreparedScene::CornerUvs(uint32_t triangle, uint32_t set,
+                                              const float (&m)[6]) const {
+  std::array<Vec2f, 3> corner;
+  for (size_t i = 0; i < 3; ++i) {
+    corner[i] = TransformUv(m, uv_[set][triangles_[triangle].vertex[i]]);
+  }
+  return corner;
+}
+
+// Whether all texels that lookups within the triangle can reach are black. Where that is too much
+// to look at, or the triangle reaches beyond the texture's edge, false.
+bool PreparedScene::IsBlack(int32_t texture, const std::array<Vec2f, 3>& corner) const {
+  constexpr float kMaxSide = 256.0f;
+  const PreparedTexture& t = textures_[static_cast<size_t>(texture)];
+  const auto range = [&](float a, float b, float c, uint32_t size, int64_t& first, int64_t& last) {
+    const float low = std::floor(std::min({a, b, c}) * static_cast<float>(size) - 1.0f);
+    const float high = std::ceil(std::max({a, b, c}) * static_cast<float>(size) + 1.0f);
+    if (!(low >= -2.0f) || !(high <= static_cast<float>(size) + 2.0f) || !(high - low < kMaxSide)) {
+      return false;
+    }
+    first = static_cast<int64_t>(low);
+    last = static_cast<int64_t>(high);
+    return true;
+  };
+  int64_t x0 = 0, x1 = 0, y0 = 0, y1 = 0;
+  if (!range(corner[0].x, corner[1].x, corner[2].x, t.width, x0, x1) ||
+      !range(corner[0].y, corner[1].y, corner[2].y, t.height, y0, y1)) {
+    return false;
+  }
+  // Around the edges, whatever the wrap mode: more than is looked up does no harm.
+  const auto wrapped = [](int64_t i, uint32_t size) {
+    const auto n = static_cast<int64_t>(size);
+    return static_cast<size_t>(((i % n) + n) % n);
+  };
+  const auto clamped = [](int64_t i, uint32_t size) {
+    return static_cast<size_t>(std::clamp<int64_t>(i, 0, static_cast<int64_t>(size) - 1));
+  };
+  for (int64_t y = y0; y <= y1; ++y) {
+    for (int64_t x = x0; x <= x1; ++x) {
+      for (const size_t row : {wrapped(y, t.height), clamped(y, t.height)}) {
+        for (const size_t column : {wrapped(x, t.width), clamped(x, t.width)}) {
+          const uint32_t texel = texels_[t.first_texel + row * t.width + column];
+          if ((texel & 0xffffffu) != 0) return false;
+        }
+      }
+    }
+  }
+  return true;
+}
+
+Rgb PreparedScene::MeanEmission(uint32_t triangle) const {
+  const PreparedMaterial& m = MaterialOf(triangle);
+  if (m.emission_texture < 0 && m.alpha_cutoff < 0) return m.emission;
+  double extent_texels = 0;
+  const auto look_at = [&](int32_t texture, uint32_t set, const float(&matrix)[6]) {
+    if (texture < 0) return std::array<Vec2f, 3>{};
+    const std::array<Vec2f, 3> corner = CornerUvs(triangle, set, matrix);
+    const PreparedTexture& t = textures_[static_cast<size_t>(texture)];
+    for (size_t i = 0; i < 3; ++i) {
+      const Vec2f &a = corner[i], &b = corner[(i + 1) % 3];
+      extent_texels = std::max({extent_texels, static_cast<double>(std::fabs(a.x - b.x)) * t.width,
+                                static_cast<double>(std::fabs(a.y - b.y)) * t.height});
+    }
+    return corner;
+  };
+  if (m.emission_texture >= 0 &&
+      IsBlack(m.emission_texture, look_at(m.emission_texture, m.emission_uv_set, m.emission_uv))) {
+    return {};
+  }
+  if (m.alpha_cutoff >= 0) look_at(m.base_color_texture, m.base_color_uv_set, m.base_color_uv);
+  // Centroids of the cells that n lines parallel to each side cut.
+  const int n = extent_texels < 64 ? std::max(4, static_cast<int>(extent_texels)) : 64;
+  const float step = 1.0f / static_cast<float>(n);
+  Vec3d sum;
+  int points = 0;
+  for (int i = 0; i < n; ++i) {
+    for (int j = 0; i + j < n; ++j, ++points) {
+      const float b1 = (static_cast<float>(i) + 1.0f / 3.0f) * step;
+      const float b2 = (static_cast<float>(j) + 1.0f / 3.0f) * step;
+      const SurfaceSample surface = Surface(triangle, b1, b2);
+      if (!(surface.alpha < m.alpha_cutoff)) sum += Vec3d(surface.emission);
+    }
+  }
+  // What the points missed may be there all the same.
+  constexpr float kFloor = 1.0f / 1024.0f;
+  return Max(Rgb(sum / points), m.emission * kFloor);
+}
+
+Rgb PreparedScene::MapAt(double x, double y) const {
+  const double fx = std::floor(x - 0.5), fy = std::floor(y - 0.5);
+  const auto wx = static_cast<float>(x - 0.5 - fx), wy = static_cast<float>(y - 0.5 - fy);
+  const auto column = [&](double i) {
+    const double w = static_cast<double>(map_width_);
+    return static_cast<uint32_t>(i < 0 ? i + w : i >= w ? i - w : i);
+  };
+  const auto row = [&](double j) {
+    return static_cast<uint32_t>(std::clamp(j, 0.0, static_cast<double>(map_height_) - 1.0));
+  };
+  const uint32_t x0 = column(fx), x1 = column(fx + 1), y0 = row(fy), y1 = row(fy + 1);
+  return (MapTexel(x0, y0) * (1.0f - wx) + MapTexel(x1, y0) * wx) * (1.0f - wy) +
+         (MapTexel(x0, y1) * (1.0f - wx) + MapTexel(x1, y1) * wx) * wy;
+}
+
+Rgb PreparedScene::EnvironmentRadiance(const Vec3f& w) const {
+  if (map_width_ == 0) return sky_;
+  const Vec3d d(w);
+  const double x = Dot(d, world_from_map_[0]), y = Dot(d, world_from_map_[1]),
+               z = Dot(d, world_from_map_[2]);
+  const double latitude = DetAtan2(y, std::sqrt(x * x + z * z));
+  const double longitude = DetAtan2(x, z);
+  const double width = map_width_, height = map_height_;
+  return sky_ + MapAt(std::clamp((0.5 - longitude / (2 * kPi)) * width, 0.0, width),
+                      std::clamp((0.5 - latitude / kPi) * height, 0.0, height));
 }
 
 float PreparedScene::Alpha(uint32_t triangle, float b1, float b2) const {

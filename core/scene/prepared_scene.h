@@ -17,6 +17,7 @@
 #include "core/base/blob.h"
 #include "core/base/executor.h"
 #include "core/base/status.h"
+#include "core/math/half.h"
 #include "core/scene/scene.h"
 
 namespace farpoint {
@@ -102,8 +103,28 @@ class PreparedScene {
   std::span<const PreparedMaterial> materials() const { return materials_; }
   std::span<const PreparedTexture> textures() const { return textures_; }
   std::span<const PreparedLight> lights() const { return lights_; }
+  // The constant part of the environment; a map of one colour is a part of it.
   const Rgb& sky() const { return sky_; }
-  // Objects are two-sided; a scene is lit if it has a light with power, an emitter or a sky.
+  // The environment map, if it has two colours or more: lat-long, laid out as Environment
+  // (scene.h) says, without the sky.
+  bool has_environment_map() const { return map_width_ != 0; }
+  uint32_t map_width() const { return map_width_; }
+  uint32_t map_height() const { return map_height_; }
+  const std::array<Vec3d, 3>& world_from_map() const { return world_from_map_; }
+  Rgb MapTexel(uint32_t x, uint32_t y) const {
+    const size_t at = 3 * (size_t{y} * map_width_ + x);
+    if (!map_halves_.empty()) {
+      return {HalfToFloat(map_halves_[at]), HalfToFloat(map_halves_[at + 1]),
+              HalfToFloat(map_halves_[at + 2])};
+    }
+    return {map_floats_[at], map_floats_[at + 1], map_floats_[at + 2]};
+  }
+  // The map at x in [0, map_width()], y in [0, map_height()], where texel (i, j) has its centre at
+  // (i + 0.5, j + 0.5): bilinear, around in x, held at the edge in y. There must be a map.
+  Rgb MapAt(double x, double y) const;
+  // The radiance that arrives from the unit world direction `w` if nothing lies there.
+  Rgb EnvironmentRadiance(const Vec3f& w) const;
+  // Objects are two-sided; a scene is lit if it has a light with power, an emitter, a sky or a map.
   bool has_alpha_masks() const { return has_alpha_masks_; }
   // Triangles that Prepare left out because they are degenerate.
   uint64_t dropped_triangles() const { return dropped_triangles_; }
@@ -129,6 +150,9 @@ class PreparedScene {
   // their finest level.
   SurfaceSample Surface(uint32_t triangle, float b1, float b2) const;
   float Alpha(uint32_t triangle, float b1, float b2) const;
+  // The emission averaged over the triangle, holes being black: exact if it has no texture, else
+  // the mean of up to 2,080 points. (0, 0, 0) only if all of the triangle is black.
+  Rgb MeanEmission(uint32_t triangle) const;
 
  private:
   PreparedScene() = default;
@@ -138,6 +162,8 @@ class PreparedScene {
   absl::Status CheckTables() const;
   absl::Status CheckGeometry();
   Rgb SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const;
+  std::array<Vec2f, 3> CornerUvs(uint32_t triangle, uint32_t set, const float (&m)[6]) const;
+  bool IsBlack(int32_t texture, const std::array<Vec2f, 3>& corner) const;
 
   Blob blob_;
   Vec3d origin_;
@@ -154,6 +180,10 @@ class PreparedScene {
   std::vector<uint32_t> emissive_triangles_;
   std::vector<uint32_t> object_instances_;
   Rgb sky_;
+  uint32_t map_width_ = 0, map_height_ = 0;
+  std::array<Vec3d, 3> world_from_map_{Vec3d{1, 0, 0}, Vec3d{0, 1, 0}, Vec3d{0, 0, 1}};
+  std::span<const uint16_t> map_halves_;  // RGB by texel; one of the two is empty
+  std::span<const float> map_floats_;
   bool has_alpha_masks_ = false;
   uint64_t dropped_triangles_ = 0;
 };
