@@ -1,13 +1,8 @@
 #include "proto/convert.h"
 
-#include <google/protobuf/descriptor.h>
-#include <google/protobuf/util/json_util.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
-#include <nlohmann/json.hpp>
-#include <set>
 
 namespace farpoint {
 
@@ -18,6 +13,10 @@ constexpr size_t kMaxUriBytes = 4096;
 constexpr size_t kMaxNameBytes = 200;
 constexpr size_t kMaxIdBytes = 64;
 constexpr size_t kMaxSuns = 256;
+constexpr size_t kMaxLights = 65536;
+constexpr size_t kMaxMaterials = 65536;
+constexpr size_t kMaxLines = 10000;  // of an explanation
+constexpr double kMaxRadiance = 1e30;
 constexpr size_t kMaxStatEntries = 256;
 constexpr size_t kMaxStatNameBytes = 64;
 constexpr size_t kMaxTiles = size_t{1} << 22;  // 65536² pixels in tiles of 32
@@ -66,7 +65,7 @@ void VecToWire(const Vec3d& v, v1::Vec3* wire) {
   wire->set_z(v.z);
 }
 
-absl::StatusOr<Rgb> ColorFromWire(const v1::Rgb& wire, float max, std::string_view field) {
+absl::StatusOr<Rgb> ColorFromWire(const v1::Rgb& wire, double max, std::string_view field) {
   const Rgb c(wire.r(), wire.g(), wire.b());
   for (int i = 0; i < 3; ++i) FP_RETURN_IF_ERROR(CheckRange(c[i], 0, max, field));
   return c;
@@ -93,6 +92,8 @@ absl::StatusOr<JobState> StateFromWire(v1::JobState wire, std::string_view field
       return JobState::kFailed;
     case v1::JOB_STATE_CANCELLED:
       return JobState::kCancelled;
+    case v1::JOB_STATE_PAUSED:
+      return JobState::kPaused;
     default:
       return Bad(field, std::to_string(wire), "a value of JobState");
   }
@@ -111,6 +112,8 @@ v1::JobState StateToWire(JobState state) {
       return v1::JOB_STATE_FAILED;
     case JobState::kCancelled:
       return v1::JOB_STATE_CANCELLED;
+    case JobState::kPaused:
+      return v1::JOB_STATE_PAUSED;
   }
   return v1::JOB_STATE_UNSPECIFIED;
 }
@@ -127,76 +130,185 @@ absl::Status MatrixFromWire(const google::protobuf::RepeatedField<float>& wire,
   return absl::OkStatus();
 }
 
-// Levenshtein distance.
-size_t EditDistance(std::string_view a, std::string_view b) {
-  std::vector<size_t> row(b.size() + 1);
-  for (size_t j = 0; j <= b.size(); ++j) row[j] = j;
-  for (size_t i = 1; i <= a.size(); ++i) {
-    size_t diagonal = row[0];
-    row[0] = i;
-    for (size_t j = 1; j <= b.size(); ++j) {
-      const size_t above = row[j];
-      row[j] = std::min({row[j] + 1, row[j - 1] + 1, diagonal + (a[i - 1] != b[j - 1])});
-      diagonal = above;
+absl::Status CheckCount(int count, size_t max, std::string_view field, std::string_view what) {
+  if (static_cast<size_t>(count) <= max) return absl::OkStatus();
+  return Bad(field, std::to_string(count) + " " + std::string(what),
+             "at most " + std::to_string(max));
+}
+
+absl::Status CheckName(const std::string& name, std::string_view field) {
+  if (name.empty()) return Bad(field, "empty", "a name");
+  return CheckLength(name, kMaxUriBytes, field);
+}
+
+absl::StatusOr<Vec3d> DirectionFromWire(const v1::Vec3& wire, std::string_view field) {
+  FP_ASSIGN_OR_RETURN(const Vec3d v, VecFromWire(wire, field));
+  if (MaxAbs(v) > 0) return v;
+  return Bad(field, "(0, 0, 0)", "a vector that is not zero");
+}
+
+absl::StatusOr<PunctualLight> LightFromWire(const v1::Light& wire, const std::string& field) {
+  PunctualLight light;
+  FP_RETURN_IF_ERROR(CheckLength(wire.name(), kMaxUriBytes, Path(field, "name")));
+  light.name = wire.name();
+  switch (wire.kind()) {
+    case v1::LIGHT_KIND_POINT:
+      light.kind = PunctualKind::kPoint;
+      break;
+    case v1::LIGHT_KIND_SPOT:
+      light.kind = PunctualKind::kSpot;
+      break;
+    case v1::LIGHT_KIND_DIRECTIONAL:
+      light.kind = PunctualKind::kDirectional;
+      break;
+    default:
+      return Bad(Path(field, "kind"),
+                 wire.kind() == 0 ? std::string("absent") : std::to_string(wire.kind()),
+                 "LIGHT_KIND_POINT, LIGHT_KIND_SPOT or LIGHT_KIND_DIRECTIONAL");
+  }
+  FP_ASSIGN_OR_RETURN(light.position, VecFromWire(wire.position(), Path(field, "position")));
+  if (light.kind != PunctualKind::kPoint) {
+    FP_ASSIGN_OR_RETURN(const Vec3d direction,
+                        DirectionFromWire(wire.direction(), Path(field, "direction")));
+    light.direction = NormalizeOr(direction, Vec3d(0, -1, 0));
+  }
+  FP_ASSIGN_OR_RETURN(light.intensity,
+                      ColorFromWire(wire.intensity(), kMaxRadiance, Path(field, "intensity")));
+  FP_RETURN_IF_ERROR(CheckRange(wire.range_m(), 0, kMaxRadiance, Path(field, "range_m")));
+  light.range_m = wire.range_m();
+  if (wire.has_inner_cone_rad()) light.inner_cone_rad = wire.inner_cone_rad();
+  if (wire.has_outer_cone_rad()) light.outer_cone_rad = wire.outer_cone_rad();
+  FP_RETURN_IF_ERROR(CheckRange(light.outer_cone_rad, 0, 3.14159265358979323846 / 2,
+                                Path(field, "outer_cone_rad")));
+  if (!(light.inner_cone_rad >= 0) || !(light.inner_cone_rad < light.outer_cone_rad)) {
+    return Bad(Path(field, "inner_cone_rad"), Text(light.inner_cone_rad),
+               "at least 0 and less than outer_cone_rad, which is " + Text(light.outer_cone_rad));
+  }
+  return light;
+}
+void LightToWire(const PunctualLight& light, v1::Light* wire) {
+  wire->set_name(light.name);
+  wire->set_kind(light.kind == PunctualKind::kPoint  ? v1::LIGHT_KIND_POINT
+                 : light.kind == PunctualKind::kSpot ? v1::LIGHT_KIND_SPOT
+                                                     : v1::LIGHT_KIND_DIRECTIONAL);
+  VecToWire(light.position, wire->mutable_position());
+  VecToWire(light.direction, wire->mutable_direction());
+  ColorToWire(light.intensity, wire->mutable_intensity());
+  wire->set_range_m(light.range_m);
+  wire->set_inner_cone_rad(light.inner_cone_rad);
+  wire->set_outer_cone_rad(light.outer_cone_rad);
+}
+
+absl::Status OverridesFromWire(const v1::Overrides& wire, SceneOverrides& overrides) {
+  FP_RETURN_IF_ERROR(CheckCount(wire.suns_size(), kMaxSuns, "overrides.suns", "suns"));
+  for (const v1::Sun& from : wire.suns()) {
+    SunOverride sun;
+    FP_ASSIGN_OR_RETURN(sun.to_sun, DirectionFromWire(from.to_sun(), "overrides.suns.to_sun"));
+    FP_ASSIGN_OR_RETURN(sun.irradiance, ColorFromWire(from.irradiance(), kMaxRadiance,
+                                                      "overrides.suns.irradiance"));
+    overrides.suns.push_back(sun);
+  }
+  FP_RETURN_IF_ERROR(CheckCount(wire.lights_size(), kMaxLights, "overrides.lights", "lights"));
+  for (int i = 0; i < wire.lights_size(); ++i) {
+    FP_ASSIGN_OR_RETURN(
+        PunctualLight light,
+        LightFromWire(wire.lights(i), "overrides.lights[" + std::to_string(i) + "]"));
+    overrides.lights.push_back(std::move(light));
+  }
+  if (wire.has_sky()) {
+    FP_ASSIGN_OR_RETURN(overrides.sky, ColorFromWire(wire.sky(), kMaxRadiance, "overrides.sky"));
+  }
+  if (wire.has_environment()) {
+    const v1::Environment& from = wire.environment();
+    EnvironmentOverride environment;
+    FP_RETURN_IF_ERROR(CheckName(from.uri(), "overrides.environment.uri"));
+    environment.uri = from.uri();
+    if (from.has_scale()) {
+      FP_ASSIGN_OR_RETURN(environment.scale,
+                          ColorFromWire(from.scale(), kMaxRadiance, "overrides.environment.scale"));
     }
+    FP_RETURN_IF_ERROR(
+        CheckRange(from.rotation_deg(), -1e6, 1e6, "overrides.environment.rotation_deg"));
+    environment.rotation_deg = from.rotation_deg();
+    if (from.has_up()) {
+      FP_ASSIGN_OR_RETURN(environment.up, DirectionFromWire(from.up(), "overrides.environment.up"));
+    }
+    overrides.environment = std::move(environment);
   }
-  return row[b.size()];
+  if (wire.has_albedo()) {
+    FP_ASSIGN_OR_RETURN(overrides.albedo, ColorFromWire(wire.albedo(), 1, "overrides.albedo"));
+  }
+  FP_RETURN_IF_ERROR(
+      CheckCount(wire.materials_size(), kMaxMaterials, "overrides.materials", "materials"));
+  for (int i = 0; i < wire.materials_size(); ++i) {
+    const v1::MaterialOverride& from = wire.materials(i);
+    const std::string field = "overrides.materials[" + std::to_string(i) + "]";
+    MaterialOverride material;
+    FP_RETURN_IF_ERROR(CheckName(from.name(), Path(field, "name")));
+    material.name = from.name();
+    if (from.has_base_color()) {
+      FP_ASSIGN_OR_RETURN(material.base_color,
+                          ColorFromWire(from.base_color(), 1, Path(field, "base_color")));
+    }
+    if (from.has_emission()) {
+      FP_ASSIGN_OR_RETURN(material.emission,
+                          ColorFromWire(from.emission(), kMaxRadiance, Path(field, "emission")));
+    }
+    overrides.materials.push_back(std::move(material));
+  }
+  return absl::OkStatus();
 }
 
-void CollectFieldNames(const google::protobuf::Descriptor& message, std::set<std::string>& names) {
-  for (int i = 0; i < message.field_count(); ++i) {
-    const auto* field = message.field(i);
-    names.insert(field->name());
-    if (field->message_type() != nullptr) CollectFieldNames(*field->message_type(), names);
+v1::Overrides OverridesToWire(const SceneOverrides& overrides) {
+  v1::Overrides wire;
+  for (const SunOverride& sun : overrides.suns) {
+    v1::Sun* to = wire.add_suns();
+    VecToWire(sun.to_sun, to->mutable_to_sun());
+    ColorToWire(sun.irradiance, to->mutable_irradiance());
   }
+  for (const PunctualLight& light : overrides.lights) LightToWire(light, wire.add_lights());
+  if (overrides.sky) ColorToWire(*overrides.sky, wire.mutable_sky());
+  if (overrides.environment) {
+    v1::Environment* to = wire.mutable_environment();
+    to->set_uri(overrides.environment->uri);
+    ColorToWire(overrides.environment->scale, to->mutable_scale());
+    to->set_rotation_deg(overrides.environment->rotation_deg);
+    VecToWire(overrides.environment->up, to->mutable_up());
+  }
+  if (overrides.albedo) ColorToWire(*overrides.albedo, wire.mutable_albedo());
+  for (const MaterialOverride& material : overrides.materials) {
+    v1::MaterialOverride* to = wire.add_materials();
+    to->set_name(material.name);
+    if (material.base_color) ColorToWire(*material.base_color, to->mutable_base_color());
+    if (material.emission) ColorToWire(*material.emission, to->mutable_emission());
+  }
+  return wire;
 }
 
-// "; did you mean 'spp'?" if protobuf's message is about an unknown field, else empty.
-std::string NearestField(std::string_view message) {
-  constexpr std::string_view kUnknown = ": Cannot find field.";
-  const size_t end = message.find(kUnknown);
-  if (end == std::string_view::npos) return "";
-  const size_t start = message.rfind(' ', end) + 1;  // npos + 1 == 0
-  const std::string_view unknown = message.substr(start, end - start);
-  std::set<std::string> names;
-  CollectFieldNames(*v1::RenderJob::descriptor(), names);
-  const auto nearest = std::min_element(names.begin(), names.end(), [&](auto& a, auto& b) {
-    return EditDistance(a, unknown) < EditDistance(b, unknown);
-  });
-  return std::string("; did you mean '") + *nearest + "'?";
+absl::StatusOr<std::vector<JobId>> JobIdsFromWire(
+    const google::protobuf::RepeatedPtrField<std::string>& wire, std::string_view field) {
+  FP_RETURN_IF_ERROR(CheckCount(wire.size(), kMaxAfter, field, "jobs"));
+  std::vector<JobId> ids;
+  for (const std::string& id : wire) {
+    FP_RETURN_IF_ERROR(CheckId(id, field));
+    ids.push_back({id});
+  }
+  return ids;
+}
+
+absl::StatusOr<CameraMatrices> MatricesFromWire(const v1::CameraMatrices& wire,
+                                                std::string_view field) {
+  CameraMatrices matrices;
+  FP_RETURN_IF_ERROR(MatrixFromWire(wire.world_to_camera(), matrices.world_to_camera,
+                                    Path(field, "world_to_camera")));
+  FP_RETURN_IF_ERROR(
+      MatrixFromWire(wire.world_to_ndc(), matrices.world_to_ndc, Path(field, "world_to_ndc")));
+  return matrices;
 }
 
 }  // namespace
 
-// --- The job file ----------------------------------------------------------------------------
-
-absl::StatusOr<v1::RenderJob> RenderJobFromJson(std::string_view text, std::string_view name) {
-  v1::RenderJob job;
-  const auto status = google::protobuf::util::JsonStringToMessage(
-      google::protobuf::StringPiece(text.data(), text.size()), &job);
-  if (status.ok()) return job;
-  std::string message(status.message().data(), status.message().size());
-  try {
-    // protobuf names no line; this parser does.
-    (void)nlohmann::json::parse(text.begin(), text.end());
-  } catch (const nlohmann::json::exception& e) {
-    return absl::InvalidArgumentError("'" + std::string(name) + "' is not a job file: " + e.what() +
-                                      "; correct the file there");
-  }
-  std::replace(message.begin(), message.end(), '\n', ' ');
-  return absl::InvalidArgumentError("'" + std::string(name) + "' is not a job file: " + message +
-                                    NearestField(message));
-}
-
-std::string RenderJobToJson(const v1::RenderJob& job) {
-  google::protobuf::util::JsonPrintOptions options;
-  options.add_whitespace = true;
-  options.preserve_proto_field_names = true;
-  std::string text;
-  // Fails only for messages that hold an Any of an unknown type; ours hold none.
-  (void)google::protobuf::util::MessageToJsonString(job, &text, options);
-  return text;
-}
+// --- The job ---------------------------------------------------------------------------------
 
 absl::StatusOr<JobSpec> JobFromWire(const v1::RenderJob& wire) {
   JobSpec job;
@@ -244,28 +356,7 @@ absl::StatusOr<JobSpec> JobFromWire(const v1::RenderJob& wire) {
     }
   }
 
-  if (static_cast<size_t>(wire.overrides().suns_size()) > kMaxSuns) {
-    return Bad("overrides.suns", std::to_string(wire.overrides().suns_size()) + " suns",
-               "at most " + std::to_string(kMaxSuns));
-  }
-  for (const v1::Sun& from : wire.overrides().suns()) {
-    SunOverride sun;
-    FP_ASSIGN_OR_RETURN(sun.to_sun, VecFromWire(from.to_sun(), "overrides.suns.to_sun"));
-    if (MaxAbs(sun.to_sun) == 0) {
-      return Bad("overrides.suns.to_sun", "(0, 0, 0)", "a vector that is not zero");
-    }
-    FP_ASSIGN_OR_RETURN(sun.irradiance,
-                        ColorFromWire(from.irradiance(), 1e30f, "overrides.suns.irradiance"));
-    job.overrides.suns.push_back(sun);
-  }
-  if (wire.overrides().has_sky()) {
-    FP_ASSIGN_OR_RETURN(job.overrides.sky,
-                        ColorFromWire(wire.overrides().sky(), 1e30f, "overrides.sky"));
-  }
-  if (wire.overrides().has_albedo()) {
-    FP_ASSIGN_OR_RETURN(job.overrides.albedo,
-                        ColorFromWire(wire.overrides().albedo(), 1, "overrides.albedo"));
-  }
+  FP_RETURN_IF_ERROR(OverridesFromWire(wire.overrides(), job.overrides));
 
   switch (wire.light_units()) {
     case v1::LIGHT_UNITS_UNSPECIFIED:
@@ -302,6 +393,14 @@ absl::StatusOr<JobSpec> JobFromWire(const v1::RenderJob& wire) {
   job.title = wire.title();
   FP_RETURN_IF_ERROR(CheckRange(wire.priority(), -1000, 1000, "priority"));
   job.priority = wire.priority();
+  FP_RETURN_IF_ERROR(CheckCount(wire.frames_size(), kMaxFrames, "frames", "frames"));
+  job.frames.assign(wire.frames().begin(), wire.frames().end());
+  if (wire.has_fps()) job.fps = wire.fps();
+  if (!(job.fps > 0) || !(job.fps <= 1000)) {
+    return Bad("fps", Text(job.fps), "more than 0, at most 1000");
+  }
+  FP_ASSIGN_OR_RETURN(job.after, JobIdsFromWire(wire.after(), "after"));
+  job.start_paused = wire.start_paused();
   return job;
 }
 
@@ -324,15 +423,7 @@ v1::RenderJob ToWire(const JobSpec& job) {
     VecToWire(look->up, to->mutable_up());
     to->set_yfov_deg(look->yfov_deg);
   }
-  for (const SunOverride& sun : job.overrides.suns) {
-    v1::Sun* to = wire.mutable_overrides()->add_suns();
-    VecToWire(sun.to_sun, to->mutable_to_sun());
-    ColorToWire(sun.irradiance, to->mutable_irradiance());
-  }
-  if (job.overrides.sky) ColorToWire(*job.overrides.sky, wire.mutable_overrides()->mutable_sky());
-  if (job.overrides.albedo) {
-    ColorToWire(*job.overrides.albedo, wire.mutable_overrides()->mutable_albedo());
-  }
+  *wire.mutable_overrides() = OverridesToWire(job.overrides);
   wire.set_light_units(job.light_units == LightUnits::kRaw ? v1::LIGHT_UNITS_RAW
                                                            : v1::LIGHT_UNITS_PHOTOMETRIC);
   wire.mutable_limits()->set_max_pixels(job.limits.max_pixels);
@@ -342,6 +433,10 @@ v1::RenderJob ToWire(const JobSpec& job) {
   wire.mutable_limits()->set_max_seconds(job.limits.max_seconds);
   wire.set_title(job.title);
   wire.set_priority(job.priority);
+  for (const int32_t frame : job.frames) wire.add_frames(frame);
+  wire.set_fps(job.fps);
+  for (const JobId& id : job.after) wire.add_after(id.value);
+  wire.set_start_paused(job.start_paused);
   return wire;
 }
 
@@ -394,6 +489,25 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
     default:
       return Bad(Path(field, "splat"), std::to_string(wire.splat()), "a value of Splat");
   }
+  switch (wire.filter()) {
+    case v1::PIXEL_FILTER_UNSPECIFIED:
+      break;
+    case v1::PIXEL_FILTER_BOX:
+      settings.filter = PixelFilter::kBox;
+      break;
+    case v1::PIXEL_FILTER_TRIANGLE:
+      settings.filter = PixelFilter::kTriangle;
+      break;
+    case v1::PIXEL_FILTER_GAUSSIAN:
+      settings.filter = PixelFilter::kGaussian;
+      break;
+    case v1::PIXEL_FILTER_BLACKMAN_HARRIS:
+      settings.filter = PixelFilter::kBlackmanHarris;
+      break;
+    default:
+      return Bad(Path(field, "filter"), std::to_string(wire.filter()), "a value of PixelFilter");
+  }
+  if (wire.has_filter_width_px()) settings.filter_width_px = wire.filter_width_px();
   if (wire.has_spp()) settings.spp = wire.spp();
   if (wire.has_paths()) settings.paths = wire.paths();
   if (wire.has_light_samples()) settings.light_samples = wire.light_samples();
@@ -441,6 +555,21 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
   wire.set_buffer_map(settings.buffer_map == BufferMap::kCosine ? v1::BUFFER_MAP_COSINE
                                                                 : v1::BUFFER_MAP_OCTAHEDRAL);
   wire.set_splat(settings.splat == Splat::kOpaque ? v1::SPLAT_OPAQUE : v1::SPLAT_COVERAGE);
+  switch (settings.filter) {
+    case PixelFilter::kBox:
+      wire.set_filter(v1::PIXEL_FILTER_BOX);
+      break;
+    case PixelFilter::kTriangle:
+      wire.set_filter(v1::PIXEL_FILTER_TRIANGLE);
+      break;
+    case PixelFilter::kGaussian:
+      wire.set_filter(v1::PIXEL_FILTER_GAUSSIAN);
+      break;
+    case PixelFilter::kBlackmanHarris:
+      wire.set_filter(v1::PIXEL_FILTER_BLACKMAN_HARRIS);
+      break;
+  }
+  wire.set_filter_width_px(settings.filter_width_px);
   wire.set_spp(settings.spp);
   wire.set_paths(settings.paths);
   wire.set_light_samples(settings.light_samples);
@@ -626,6 +755,9 @@ absl::StatusOr<JobStatus> JobStatusFromWire(const v1::JobStatus& wire) {
   FP_RETURN_IF_ERROR(CheckFraction(wire.progress(), "status.progress"));
   status.progress = wire.progress();
   status.submitted_unix_ms = wire.submitted_unix_ms();
+  const v1::FrameCounts& frames = wire.frames();
+  status.frames = {frames.total(), frames.baked(), frames.done()};
+  FP_ASSIGN_OR_RETURN(status.after, JobIdsFromWire(wire.after(), "status.after"));
   return status;
 }
 v1::JobStatus ToWire(const JobStatus& status) {
@@ -647,6 +779,10 @@ v1::JobStatus ToWire(const JobStatus& status) {
   wire.set_priority(status.priority);
   wire.set_progress(status.progress);
   wire.set_submitted_unix_ms(status.submitted_unix_ms);
+  wire.mutable_frames()->set_total(status.frames.total);
+  wire.mutable_frames()->set_baked(status.frames.baked);
+  wire.mutable_frames()->set_done(status.frames.done);
+  for (const JobId& id : status.after) wire.add_after(id.value);
   return wire;
 }
 
@@ -684,6 +820,7 @@ v1::WorkerStatus ToWire(const WorkerStatus& status) {
 absl::StatusOr<JobEvent> JobEventFromWire(const v1::JobEvent& wire) {
   JobEvent event;
   event.sequence = wire.sequence();
+  event.unix_ms = wire.unix_ms();
   FP_ASSIGN_OR_RETURN(event.status, JobStatusFromWire(wire.status()));
   switch (wire.event_case()) {
     case v1::JobEvent::kStateChanged: {
@@ -701,6 +838,10 @@ absl::StatusOr<JobEvent> JobEventFromWire(const v1::JobEvent& wire) {
     case v1::JobEvent::kNote:
       event.body = wire.note();
       break;
+    case v1::JobEvent::kLog: {
+      FP_ASSIGN_OR_RETURN(event.body, LogLineFromWire(wire.log()));
+      break;
+    }
     case v1::JobEvent::kProgress:
     case v1::JobEvent::EVENT_NOT_SET:
       break;
@@ -710,6 +851,7 @@ absl::StatusOr<JobEvent> JobEventFromWire(const v1::JobEvent& wire) {
 v1::JobEvent ToWire(const JobEvent& event) {
   v1::JobEvent wire;
   wire.set_sequence(event.sequence);
+  wire.set_unix_ms(event.unix_ms);
   *wire.mutable_status() = ToWire(event.status);
   if (const auto* state = std::get_if<JobState>(&event.body)) {
     wire.set_state_changed(StateToWire(*state));
@@ -718,9 +860,63 @@ v1::JobEvent ToWire(const JobEvent& event) {
     wire.mutable_tile_committed()->set_sha256(ToWire(tile->sha256));
   } else if (const auto* note = std::get_if<std::string>(&event.body)) {
     wire.set_note(*note);
+  } else if (const auto* line = std::get_if<LogLine>(&event.body)) {
+    *wire.mutable_log() = ToWire(*line);
   } else {
     wire.set_progress(true);
   }
+  return wire;
+}
+
+absl::StatusOr<LogLine> LogLineFromWire(const v1::LogLine& wire) {
+  LogLine line;
+  switch (wire.level()) {
+    case v1::LOG_LEVEL_INFO:
+      line.level = LogLevel::kInfo;
+      break;
+    case v1::LOG_LEVEL_WARNING:
+      line.level = LogLevel::kWarning;
+      break;
+    case v1::LOG_LEVEL_ERROR:
+      line.level = LogLevel::kError;
+      break;
+    default:
+      return Bad("log.level", std::to_string(wire.level()), "a value of LogLevel");
+  }
+  line.text = wire.text();
+  if (wire.has_tile()) line.tile = wire.tile();
+  line.attempt = wire.attempt();
+  line.worker = wire.worker();
+  return line;
+}
+
+v1::LogLine ToWire(const LogLine& line) {
+  v1::LogLine wire;
+  switch (line.level) {
+    case LogLevel::kInfo:
+      wire.set_level(v1::LOG_LEVEL_INFO);
+      break;
+    case LogLevel::kWarning:
+      wire.set_level(v1::LOG_LEVEL_WARNING);
+      break;
+    case LogLevel::kError:
+      wire.set_level(v1::LOG_LEVEL_ERROR);
+      break;
+  }
+  wire.set_text(line.text);
+  if (line.tile) wire.set_tile(*line.tile);
+  wire.set_attempt(line.attempt);
+  wire.set_worker(line.worker);
+  return wire;
+}
+
+absl::StatusOr<Explanation> ExplanationFromWire(const v1::ExplainResponse& wire) {
+  FP_RETURN_IF_ERROR(CheckCount(wire.lines_size(), kMaxLines, "lines", "lines"));
+  return Explanation{.lines = {wire.lines().begin(), wire.lines().end()}};
+}
+v1::ExplainResponse ToWire(const Explanation& explanation) {
+  v1::ExplainResponse wire;
+  for (const std::string& line : explanation.lines) wire.add_lines(line);
   return wire;
 }
 
@@ -740,20 +936,33 @@ absl::StatusOr<JobInfo> JobInfoFromWire(const v1::FetchInfoResponse& wire) {
       return Bad("tiles.rect", "outside the crop", "rectangles inside the job's crop");
     }
     FP_ASSIGN_OR_RETURN(tile.sha256, DigestFromWire(from.sha256(), "tiles.sha256", true));
+    tile.frame = from.frame();
+    if (tile.frame >= info.spec.frame_count()) {
+      return Bad("tiles.frame", std::to_string(tile.frame),
+                 "less than " + std::to_string(info.spec.frame_count()));
+    }
     info.tiles.push_back(tile);
   }
-  FP_RETURN_IF_ERROR(MatrixFromWire(wire.camera().world_to_camera(), info.camera.world_to_camera,
-                                    "camera.world_to_camera"));
-  FP_RETURN_IF_ERROR(MatrixFromWire(wire.camera().world_to_ndc(), info.camera.world_to_ndc,
-                                    "camera.world_to_ndc"));
+  if (static_cast<size_t>(wire.frames_size()) != info.spec.frame_count()) {
+    return Bad("frames", std::to_string(wire.frames_size()),
+               "one for each of the job's " + std::to_string(info.spec.frame_count()));
+  }
+  info.frames.reserve(static_cast<size_t>(wire.frames_size()));
+  for (const v1::FrameInfo& from : wire.frames()) {
+    FrameInfo frame;
+    frame.number = from.number();
+    frame.baked = from.has_blobs();
+    if (frame.baked) {
+      FP_ASSIGN_OR_RETURN(frame.camera, MatricesFromWire(from.camera(), "frames.camera"));
+      FP_ASSIGN_OR_RETURN(frame.blobs, SceneBlobsFromWire(from.blobs()));
+    }
+    info.frames.push_back(frame);
+  }
   FP_ASSIGN_OR_RETURN(info.stats, StatsFromWire(wire.stats()));
   if (static_cast<size_t>(wire.notes_size()) > kMaxNotes) {
     return Bad("notes", std::to_string(wire.notes_size()), "at most " + std::to_string(kMaxNotes));
   }
   info.notes.assign(wire.notes().begin(), wire.notes().end());
-  if (wire.has_blobs()) {
-    FP_ASSIGN_OR_RETURN(info.blobs, SceneBlobsFromWire(wire.blobs()));
-  }
   info.version = wire.version();
   return info;
 }
@@ -766,12 +975,18 @@ v1::FetchInfoResponse ToWire(const JobInfo& info) {
     v1::TileInfo* to = wire.add_tiles();
     *to->mutable_rect() = ToWire(tile.rect);
     to->set_sha256(ToWire(tile.sha256));
+    to->set_frame(tile.frame);
   }
-  for (float v : info.camera.world_to_camera) wire.mutable_camera()->add_world_to_camera(v);
-  for (float v : info.camera.world_to_ndc) wire.mutable_camera()->add_world_to_ndc(v);
+  for (const FrameInfo& frame : info.frames) {
+    v1::FrameInfo* to = wire.add_frames();
+    to->set_number(frame.number);
+    if (!frame.baked) continue;
+    for (float v : frame.camera.world_to_camera) to->mutable_camera()->add_world_to_camera(v);
+    for (float v : frame.camera.world_to_ndc) to->mutable_camera()->add_world_to_ndc(v);
+    *to->mutable_blobs() = ToWire(frame.blobs);
+  }
   *wire.mutable_stats() = ToWire(info.stats);
   for (const std::string& note : info.notes) wire.add_notes(note);
-  if (!info.blobs.prepared_scene.empty()) *wire.mutable_blobs() = ToWire(info.blobs);
   wire.set_version(info.version);
   return wire;
 }
@@ -835,6 +1050,7 @@ absl::StatusOr<TileWork> TileWorkFromWire(const v1::TileWork& wire) {
   FP_ASSIGN_OR_RETURN(work.blobs, SceneBlobsFromWire(wire.blobs()));
   FP_RETURN_IF_ERROR(CheckRange(wire.lease_ms(), 1, 1e9, "lease_ms"));
   work.lease_time = std::chrono::milliseconds(wire.lease_ms());
+  work.frame_index = wire.frame_index();
   return work;
 }
 v1::TileWork ToWire(const TileWork& work) {
@@ -849,6 +1065,7 @@ v1::TileWork ToWire(const TileWork& work) {
   *wire.mutable_frame()->mutable_settings() = ToWire(work.frame.settings);
   *wire.mutable_blobs() = ToWire(work.blobs);
   wire.set_lease_ms(static_cast<uint32_t>(work.lease_time.count()));
+  wire.set_frame_index(work.frame_index);
   return wire;
 }
 

@@ -15,8 +15,9 @@ namespace farpoint {
 // --- The job file ----------------------------------------------------------------------------
 
 // The JSON form of RenderJob; field names as in the .proto (snake_case) or in lowerCamelCase.
-// `name` (the file's) is for messages. kInvalidArgument for anything that is not such a message,
-// an unknown field included; the nearest known field is named.
+// `name` (the file's) is for messages. kInvalidArgument for anything that is not such a message:
+// bad JSON by line and column, an unknown field by its path and the nearest known one, a wrong
+// value by its path, the value and what is allowed.
 absl::StatusOr<v1::RenderJob> RenderJobFromJson(std::string_view text, std::string_view name);
 // Indented, snake_case.
 std::string RenderJobToJson(const v1::RenderJob& job);
@@ -69,6 +70,13 @@ v1::WorkerStatus ToWire(const WorkerStatus& status);
 
 absl::StatusOr<JobEvent> JobEventFromWire(const v1::JobEvent& wire);
 v1::JobEvent ToWire(const JobEvent& event);
+
+absl::StatusOr<LogLine> LogLineFromWire(const v1::LogLine& wire);
+v1::LogLine ToWire(const LogLine& line);
+
+// At most 10,000 lines.
+absl::StatusOr<Explanation> ExplanationFromWire(const v1::ExplainResponse& wire);
+v1::ExplainResponse ToWire(const Explanation& explanation);
 
 absl::StatusOr<JobInfo> JobInfoFromWire(const v1::FetchInfoResponse& wire);
 v1::FetchInfoResponse ToWire(const JobInfo& info);

@@ -3,6 +3,10 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <set>
+
+#include "core/base/nearest_name.h"
+#include "core/scene/environment_image.h"
 
 namespace farpoint {
 
@@ -30,6 +34,91 @@ absl::Status CheckColor(const Rgb& c, std::string_view field, float max) {
     if (!(c[i] >= 0) || !(c[i] <= max)) {
       return Bad(field, Text(Vec3d(c)), "numbers from 0 to " + Text(max));
     }
+  }
+  return absl::OkStatus();
+}
+
+absl::Status CheckOverrides(const JobSpec& job) {
+  const SceneOverrides& overrides = job.overrides;
+  for (const SunOverride& sun : overrides.suns) {
+    if (!IsFinite(sun.to_sun) || MaxAbs(sun.to_sun) == 0) {
+      return Bad("overrides.suns.to_sun", Text(sun.to_sun), "a finite vector that is not zero");
+    }
+    FP_RETURN_IF_ERROR(CheckColor(sun.irradiance, "overrides.suns.irradiance", 1e30f));
+  }
+  for (size_t i = 0; i < overrides.lights.size(); ++i) {
+    const PunctualLight& light = overrides.lights[i];
+    const std::string field = "overrides.lights[" + std::to_string(i) + "]";
+    if (!IsFinite(light.position)) {
+      return Bad(field + ".position", Text(light.position), "finite numbers");
+    }
+    if (light.kind != PunctualKind::kPoint &&
+        (!IsFinite(light.direction) || std::abs(Length2(light.direction) - 1) > 1e-6)) {
+      return Bad(field + ".direction", Text(light.direction), "a vector of length 1");
+    }
+    FP_RETURN_IF_ERROR(CheckColor(light.intensity, field + ".intensity", 1e30f));
+    if (!(light.range_m >= 0) || !(light.range_m <= 1e30)) {
+      return Bad(field + ".range_m", Text(light.range_m), "numbers from 0 to 1e+30");
+    }
+    if (!(light.inner_cone_rad >= 0) || !(light.inner_cone_rad < light.outer_cone_rad) ||
+        !(light.outer_cone_rad <= 90 * kDegree)) {
+      return Bad(field + ".inner_cone_rad and outer_cone_rad",
+                 Text(light.inner_cone_rad) + " and " + Text(light.outer_cone_rad),
+                 "0 <= inner < outer <= pi/2");
+    }
+  }
+  if (overrides.sky) FP_RETURN_IF_ERROR(CheckColor(*overrides.sky, "overrides.sky", 1e30f));
+  if (overrides.environment) {
+    const EnvironmentOverride& environment = *overrides.environment;
+    if (!job.asset_files.contains(environment.uri)) {
+      return absl::InvalidArgumentError("overrides.environment.uri '" + environment.uri +
+                                        "' is not among asset.files; add it with its sha256");
+    }
+    FP_RETURN_IF_ERROR(CheckColor(environment.scale, "overrides.environment.scale", 1e30f));
+    if (!std::isfinite(environment.rotation_deg)) {
+      return Bad("overrides.environment.rotation_deg", Text(environment.rotation_deg),
+                 "a finite number");
+    }
+    if (!IsFinite(environment.up) || MaxAbs(environment.up) == 0) {
+      return Bad("overrides.environment.up", Text(environment.up),
+                 "a finite vector that is not zero");
+    }
+  }
+  if (overrides.albedo) FP_RETURN_IF_ERROR(CheckColor(*overrides.albedo, "overrides.albedo", 1));
+  for (size_t i = 0; i < overrides.materials.size(); ++i) {
+    const MaterialOverride& material = overrides.materials[i];
+    const std::string field = "overrides.materials[" + std::to_string(i) + "]";
+    if (material.name.empty()) return Bad(field + ".name", "empty", "a material of the scene");
+    if (material.base_color) {
+      FP_RETURN_IF_ERROR(CheckColor(*material.base_color, field + ".base_color", 1));
+    }
+    if (material.emission) {
+      FP_RETURN_IF_ERROR(CheckColor(*material.emission, field + ".emission", 1e30f));
+    }
+  }
+  return absl::OkStatus();
+}
+
+absl::Status CheckSchedule(const JobSpec& job) {
+  if (job.frames.size() > kMaxFrames) {
+    return Bad("frames", std::to_string(job.frames.size()) + " frames",
+               "at most " + std::to_string(kMaxFrames));
+  }
+  std::set<int32_t> frames;
+  for (const int32_t frame : job.frames) {
+    if (!frames.insert(frame).second) {
+      return Bad("frames", std::to_string(frame) + " twice", "each frame once");
+    }
+  }
+  if (!(job.fps > 0) || !(job.fps <= 1000)) {
+    return Bad("fps", Text(job.fps), "more than 0, at most 1000");
+  }
+  if (job.after.size() > kMaxAfter) {
+    return Bad("after", std::to_string(job.after.size()) + " jobs",
+               "at most " + std::to_string(kMaxAfter));
+  }
+  if (job.priority < kMinPriority || job.priority > kMaxPriority) {
+    return Bad("priority", std::to_string(job.priority), "-1000 to 1000");
   }
   return absl::OkStatus();
 }
@@ -76,21 +165,10 @@ absl::Status ValidateJob(const JobSpec& job) {
                                       "' is not among asset.files; add it with its sha256");
   }
   if (const auto* look = std::get_if<LookAt>(&job.camera)) FP_RETURN_IF_ERROR(CheckLookAt(*look));
-  for (const SunOverride& sun : job.overrides.suns) {
-    if (!IsFinite(sun.to_sun) || MaxAbs(sun.to_sun) == 0) {
-      return Bad("overrides.suns.to_sun", Text(sun.to_sun), "a finite vector that is not zero");
-    }
-    FP_RETURN_IF_ERROR(CheckColor(sun.irradiance, "overrides.suns.irradiance", 1e30f));
-  }
-  if (job.overrides.sky) FP_RETURN_IF_ERROR(CheckColor(*job.overrides.sky, "overrides.sky", 1e30f));
-  if (job.overrides.albedo) {
-    FP_RETURN_IF_ERROR(CheckColor(*job.overrides.albedo, "overrides.albedo", 1));
-  }
+  FP_RETURN_IF_ERROR(CheckOverrides(job));
+  FP_RETURN_IF_ERROR(CheckSchedule(job));
   if (job.title.size() > kMaxTitleBytes) {
     return Bad("title", std::to_string(job.title.size()) + " bytes long", "at most 200 bytes");
-  }
-  if (job.priority < -1000 || job.priority > 1000) {
-    return Bad("priority", std::to_string(job.priority), "-1000 to 1000");
   }
   if (static_cast<uint64_t>(job.film.crop.area()) > job.limits.max_pixels) {
     return absl::ResourceExhaustedError(
@@ -134,17 +212,68 @@ absl::StatusOr<Camera> ResolveCamera(const CameraChoice& choice, const Scene& sc
   return scene.cameras.front();
 }
 
-void ApplyOverrides(const SceneOverrides& overrides, Scene& scene) {
-  if (!overrides.suns.empty()) {
-    scene.lights.clear();
-    for (const SunOverride& sun : overrides.suns) {
-      PunctualLight light;
-      light.name = "sun " + std::to_string(scene.lights.size());
-      light.kind = PunctualKind::kDirectional;
-      light.direction = -NormalizeOr(sun.to_sun, Vec3d(0, 1, 0));
-      light.intensity = sun.irradiance;
-      scene.lights.push_back(std::move(light));
-    }
+namespace {
+
+void ReplaceLights(const SceneOverrides& overrides, Scene& scene) {
+  if (overrides.suns.empty() && overrides.lights.empty()) return;
+  scene.lights.clear();
+  for (const SunOverride& sun : overrides.suns) {
+    PunctualLight light;
+    light.name = "sun " + std::to_string(scene.lights.size());
+    light.kind = PunctualKind::kDirectional;
+    light.direction = -NormalizeOr(sun.to_sun, Vec3d(0, 1, 0));
+    light.intensity = sun.irradiance;
+    scene.lights.push_back(std::move(light));
+  }
+  scene.lights.insert(scene.lights.end(), overrides.lights.begin(), overrides.lights.end());
+}
+
+absl::Status ReplaceEnvironment(const EnvironmentOverride& from, const AssetBundle& asset,
+                                Environment& environment) {
+  const auto file = asset.files.find(from.uri);
+  if (file == asset.files.end()) {
+    return absl::NotFoundError("overrides.environment.uri '" + from.uri +
+                               "' is not among the job's files; add it to asset.files");
+  }
+  environment = {};
+  FP_RETURN_IF_ERROR(LoadEnvironmentMap(file->second, from.uri, environment));
+  FP_RETURN_IF_ERROR(OrientEnvironmentMap(from.up, from.rotation_deg, environment));
+  for (Rgb& texel : environment.map) texel = texel * from.scale;
+  for (const Rgb& texel : environment.map) {
+    if (IsFinite(texel)) continue;
+    return absl::InvalidArgumentError("overrides.environment.scale makes '" + from.uri +
+                                      "' larger than a number can be; choose a smaller scale");
+  }
+  return absl::OkStatus();
+}
+
+// A mask needs its texture's alpha: only then the texture stays, and its colour with it.
+void SetBaseColor(const Rgb& color, Material& material) {
+  material.base_color = color;
+  if (material.alpha_mode != AlphaMode::kMask) material.base_color_texture = {};
+}
+
+// "'a', 'b'": the three names nearest to `name`.
+std::string NearestMaterials(const std::string& name, const Scene& scene) {
+  std::set<std::string> names;
+  for (const Material& material : scene.materials) names.insert(material.name);
+  std::vector<std::pair<int, std::string>> ranked;
+  for (const std::string& known : names) ranked.emplace_back(EditDistance(name, known), known);
+  std::sort(ranked.begin(), ranked.end());
+  std::string text;
+  for (size_t i = 0; i < std::min<size_t>(3, ranked.size()); ++i) {
+    text += (i > 0 ? ", '" : "'") + ranked[i].second + "'";
+  }
+  return text;
+}
+
+}  // namespace
+
+absl::Status ApplyOverrides(const SceneOverrides& overrides, const AssetBundle& asset,
+                            Scene& scene) {
+  ReplaceLights(overrides, scene);
+  if (overrides.environment) {
+    FP_RETURN_IF_ERROR(ReplaceEnvironment(*overrides.environment, asset, scene.environment));
   }
   if (overrides.sky) scene.environment.sky = *overrides.sky;
   if (overrides.albedo) {
@@ -157,12 +286,26 @@ void ApplyOverrides(const SceneOverrides& overrides, Scene& scene) {
       used = true;
     }
     if (used) scene.materials.emplace_back().name = "default";
-    for (Material& material : scene.materials) {
-      material.base_color = *overrides.albedo;
-      // A mask needs its texture's alpha: only then the texture stays, and its colour with it.
-      if (material.alpha_mode != AlphaMode::kMask) material.base_color_texture = {};
-    }
+    for (Material& material : scene.materials) SetBaseColor(*overrides.albedo, material);
   }
+  for (const MaterialOverride& from : overrides.materials) {
+    bool found = false;
+    for (Material& material : scene.materials) {
+      if (material.name != from.name) continue;
+      found = true;
+      if (from.base_color) SetBaseColor(*from.base_color, material);
+      if (from.emission) {
+        material.emission = *from.emission;
+        material.emission_texture = {};
+      }
+    }
+    if (found) continue;
+    const std::string nearest = NearestMaterials(from.name, scene);
+    return absl::NotFoundError(
+        "overrides.materials: the scene has no material '" + from.name + "'; " +
+        (nearest.empty() ? std::string("it has none") : "the nearest are " + nearest));
+  }
+  return absl::OkStatus();
 }
 
 std::string_view NameOf(JobState state) {
@@ -179,6 +322,20 @@ std::string_view NameOf(JobState state) {
       return "failed";
     case JobState::kCancelled:
       return "cancelled";
+    case JobState::kPaused:
+      return "paused";
+  }
+  return "unknown";
+}
+
+std::string_view NameOf(LogLevel level) {
+  switch (level) {
+    case LogLevel::kInfo:
+      return "info";
+    case LogLevel::kWarning:
+      return "warning";
+    case LogLevel::kError:
+      return "error";
   }
   return "unknown";
 }

@@ -21,12 +21,13 @@
 #include "core/math/vec.h"
 #include "core/render/frame_renderer.h"
 #include "core/render/settings.h"
+#include "core/scene/asset.h"
 #include "core/scene/importer.h"
 
 namespace farpoint {
 
 // Raised whenever an older peer would misunderstand a newer one. Checked at Submit and Register.
-inline constexpr uint32_t kProtocolVersion = 1;
+inline constexpr uint32_t kProtocolVersion = 2;
 // Bulk data travel in pieces of this size; nobody sends or accepts larger ones.
 inline constexpr size_t kChunkBytes = size_t{1} << 20;
 
@@ -58,15 +59,33 @@ struct SunOverride {
   Vec3d to_sun;    // from the scene to the sun, any length but zero
   Rgb irradiance;  // on a facing surface, W/m²
 };
+// An environment map in place of the scene's sky and map; with SceneOverrides::sky both add up.
+struct EnvironmentOverride {
+  std::string uri;          // key in asset_files: a lat-long OpenEXR image
+  Rgb scale{1, 1, 1};       // of its radiance, >= 0
+  double rotation_deg = 0;  // of the map about `up`, counter-clockwise seen from above
+  Vec3d up{0, 1, 0};        // world, any length: where the map's top row points
+};
+// The scene's materials of exactly this name.
+struct MaterialOverride {
+  std::string name;
+  // [0, 1]; its texture is left out, unless the material is a mask, which needs the texture's alpha
+  std::optional<Rgb> base_color;
+  std::optional<Rgb> emission;  // radiance; its texture is left out
+};
 struct SceneOverrides {
-  std::vector<SunOverride> suns;  // not empty: in place of the scene's punctual lights
-  std::optional<Rgb> sky;         // radiance, in place of the scene's sky
-  std::optional<Rgb> albedo;      // of every material, [0, 1]; base-colour textures are left out
+  // One of them not empty: together in place of the scene's punctual lights.
+  std::vector<SunOverride> suns;
+  std::vector<PunctualLight> lights;
+  std::optional<Rgb> sky;  // radiance, in place of the scene's sky
+  std::optional<EnvironmentOverride> environment;
+  std::optional<Rgb> albedo;  // of every material, [0, 1]; base-colour textures are left out
+  std::vector<MaterialOverride> materials;  // in order, after `albedo`
 };
 
 // What a job may use at most. The coordinator has limits of its own; the smaller one wins.
 struct JobLimits {
-  uint64_t max_pixels = uint64_t{1} << 30;       // of the crop
+  uint64_t max_pixels = uint64_t{1} << 30;       // of the crop, of one frame
   uint64_t max_asset_bytes = uint64_t{1} << 36;  // all files together
   uint64_t max_triangles = 200'000'000;          // after instancing
   uint64_t max_surfels = uint64_t{1} << 31;
@@ -86,32 +105,73 @@ struct JobSpec {
   JobLimits limits;
   std::string title;     // at most 200 bytes
   int32_t priority = 0;  // higher goes first, -1000..1000
-};
 
-// Everything that can be known without the scene: settings, film, camera, overrides, limits, and
-// that the asset names its root among its files. kInvalidArgument names the field and what is
-// allowed; kResourceExhausted the limit that the film exceeds.
+  // Empty: one still, at the scene's rest pose. Else the frames of an animation in the order
+  // wanted, all different, at most kMaxFrames; frame f shows the scene at the time f / fps.
+  std::vector<int32_t> frames;
+  double fps = 24;           // (0, 1000]
+  std::vector<JobId> after;  // jobs that must be done before this one starts; at most 64
+  bool start_paused = false;
+
+  // A still is one frame of number 0.
+  uint32_t frame_count() const {
+    return frames.empty() ? 1u : static_cast<uint32_t>(frames.size());
+  }
+  int32_t frame_number(uint32_t index) const { return frames.empty() ? 0 : frames[index]; }
+  // Seconds; none for a still.
+  std::optional<double> frame_time_s(uint32_t index) const {
+    if (frames.empty()) return std::nullopt;
+    return frames[index] / fps;
+  }
+};
+inline constexpr int32_t kMinPriority = -1000, kMaxPriority = 1000;
+inline constexpr size_t kMaxFrames = 100'000;
+inline constexpr size_t kMaxAfter = 64;
+
+// Everything that can be known without the scene: settings, film, camera, overrides, frames,
+// limits, and that the asset names its root and its environment map among its files.
+// kInvalidArgument names the field and what is allowed; kResourceExhausted the limit that the film
+// exceeds.
 absl::Status ValidateJob(const JobSpec& job);
 
 // The camera that `choice` means in `scene`: kNotFound lists the scene's cameras if the name is
 // not among them; kInvalidArgument if a LookAt has no direction.
 absl::StatusOr<Camera> ResolveCamera(const CameraChoice& choice, const Scene& scene);
 
-// Replaces what `overrides` names.
-void ApplyOverrides(const SceneOverrides& overrides, Scene& scene);
+// Replaces what `overrides` names; files of the overrides are read from `asset`. kNotFound for a
+// material that the scene does not have (the nearest names are given) or a file that is missing,
+// kInvalidArgument for a map that cannot be read.
+absl::Status ApplyOverrides(const SceneOverrides& overrides, const AssetBundle& asset,
+                            Scene& scene);
 
 // --- What is known about a job ---------------------------------------------------------------
 
-enum class JobState : uint32_t { kQueued, kBaking, kRendering, kDone, kFailed, kCancelled };
+enum class JobState : uint32_t {
+  kQueued,     // waits for other jobs or for its first bake
+  kBaking,     // its first frame is baked
+  kRendering,  // from the first baked frame on
+  kDone,
+  kFailed,
+  kCancelled,
+  kPaused,  // not final, but no tile is leased and no bake started until it is resumed
+};
 std::string_view NameOf(JobState state);  // "queued", "baking", …
 inline bool IsFinal(JobState s) {
   return s == JobState::kDone || s == JobState::kFailed || s == JobState::kCancelled;
 }
 
-// queued + leased + committed + failed = total, at any time.
+// Tiles of all frames: index = frame index * tiles of a frame + tile within the frame.
+// queued + leased + committed + failed = total, at any time. A tile whose frame is not baked yet is
+// queued. In a cancelled job what is not committed is queued: nothing failed, and a requeue goes on
+// there. In a failed job it is failed.
 struct TileCounts {
   uint32_t queued = 0, leased = 0, committed = 0, failed = 0, total = 0;
   bool operator==(const TileCounts&) const = default;
+};
+
+struct FrameCounts {
+  uint32_t total = 1, baked = 0, done = 0;  // done: all of its tiles are committed
+  bool operator==(const FrameCounts&) const = default;
 };
 
 struct JobStatus {
@@ -126,6 +186,8 @@ struct JobStatus {
   int32_t priority = 0;
   double progress = 0;  // [0, 1]; tiles in work count by their progress
   int64_t submitted_unix_ms = 0;
+  FrameCounts frames;
+  std::vector<JobId> after;
 };
 
 struct WorkerStatus {
@@ -144,12 +206,33 @@ struct TileCommitted {
   uint32_t tile = 0;
   Digest sha256;  // of its bytes
 };
+enum class LogLevel : uint32_t { kInfo, kWarning, kError };
+std::string_view NameOf(LogLevel level);  // "info", "warning", "error"
+
+// What happened to a job and is no news of its image: leases lost, results refused, failures of
+// workers, pauses. At most kMaxLogLines of a job are kept; one more says that there were more.
+struct LogLine {
+  LogLevel level = LogLevel::kInfo;
+  std::string text;
+  std::optional<uint32_t> tile;
+  uint32_t attempt = 0;  // of the tile; 0: none
+  std::string worker;    // its name; may be empty
+  bool operator==(const LogLine&) const = default;
+};
+inline constexpr uint32_t kMaxLogLines = 10'000;
+
 // monostate: a passing report of progress.
-using JobEventBody = std::variant<std::monostate, JobState, TileCommitted, std::string>;
+using JobEventBody = std::variant<std::monostate, JobState, TileCommitted, std::string, LogLine>;
 struct JobEvent {
   uint64_t sequence = 0;  // from 1, without gaps; 0 for a passing report, which is not kept
   JobEventBody body;      // the string is a note for the user
   JobStatus status;       // when it was sent
+  int64_t unix_ms = 0;    // when it happened, by the coordinator's clock; 0: not known
+};
+
+// Why a job is in the state that it is in, for people: one line each.
+struct Explanation {
+  std::vector<std::string> lines;
 };
 
 struct SceneBlobs {
@@ -161,7 +244,8 @@ struct SceneBlobs {
 
 struct TileInfo {
   PixelRect rect;
-  Digest sha256;  // empty until it is committed
+  Digest sha256;       // empty until it is committed
+  uint32_t frame = 0;  // index into JobInfo::frames
 };
 // Row-major 4x4, row vectors (OpenEXR's convention): ndc = (x, y, z, 1) * world_to_ndc.
 struct CameraMatrices {
@@ -169,15 +253,22 @@ struct CameraMatrices {
 };
 CameraMatrices MatricesOf(const Camera& camera, const FilmSpec& film);
 
-// What a client must know to stitch and to write an image.
+struct FrameInfo {
+  int32_t number = 0;
+  bool baked = false;
+  // All zero and empty before the frame is baked.
+  CameraMatrices camera;
+  SceneBlobs blobs;
+};
+
+// What a client must know to stitch and to write images.
 struct JobInfo {
   JobStatus status;
   JobSpec spec;
-  std::vector<TileInfo> tiles;  // in tile order; empty before the bake has finished
-  CameraMatrices camera;        // all zero before the bake has finished
-  Stats stats;                  // of the bake and of all committed tiles, added in tile order
+  std::vector<TileInfo> tiles;    // in tile order; empty before the first frame is baked
+  std::vector<FrameInfo> frames;  // in the order of the job; one of number 0 for a still
+  Stats stats;                    // of the bakes in frame order and the committed tiles in theirs
   std::vector<std::string> notes;
-  SceneBlobs blobs;
   std::string version;  // of the coordinator
 };
 
@@ -208,6 +299,7 @@ struct TileWork {
   JobId job;
   uint32_t tile = 0;
   PixelRect rect;
+  uint32_t frame_index = 0;  // of the job: camera and blobs are equal for equal job and index
   FrameSpec frame;
   SceneBlobs blobs;
   std::chrono::milliseconds lease_time{0};  // lost if progress stops for so long

@@ -119,6 +119,7 @@ class CoordinatorImpl final : public Coordinator {
     JobSpec spec = given;
     spec.limits = Smaller(spec.limits, options_.limits);
     FP_RETURN_IF_ERROR(ValidateJob(spec));
+    if (spec.frame_count() > 1 || !spec.after.empty() || spec.start_paused) return NotYet();
     std::vector<PixelRect> tiles = TilesOf(spec.film, static_cast<int>(spec.settings.tile_px));
     if (tiles.size() > kMaxTilesPerJob) {
       return absl::InvalidArgumentError(
@@ -195,6 +196,13 @@ class CoordinatorImpl final : public Coordinator {
     return absl::OkStatus();
   }
 
+  absl::Status Pause(const JobId&) override { return NotYet(); }
+  absl::Status Resume(const JobId&) override { return NotYet(); }
+  absl::Status SetPriority(const JobId&, int32_t) override { return NotYet(); }
+  absl::Status Requeue(const JobId&, bool) override { return NotYet(); }
+  absl::StatusOr<Explanation> Explain(const JobId&) override { return NotYet(); }
+  static absl::Status NotYet() { return absl::UnimplementedError("this call is not built yet"); }
+
   absl::StatusOr<std::vector<JobEvent>> NextEvents(const JobId& id, uint64_t after_sequence,
                                                    std::chrono::milliseconds wait) override {
     const auto deadline = std::chrono::steady_clock::now() + std::min(wait, kMaxWait);
@@ -237,7 +245,9 @@ class CoordinatorImpl final : public Coordinator {
       info.status = StatusOf(*job);
       info.spec = job->stored.spec;
       info.notes = job->stored.notes;
-      info.blobs = job->stored.blobs;
+      info.frames.resize(1);
+      info.frames[0].number = info.spec.frame_number(0);
+      info.frames[0].blobs = job->stored.blobs;
       info.stats = job->stored.bake_stats;
       camera = job->stored.camera;
       if (camera) {
@@ -246,7 +256,8 @@ class CoordinatorImpl final : public Coordinator {
     }
     info.version = FARPOINT_VERSION;
     if (!camera) return info;
-    info.camera = MatricesOf(*camera, info.spec.film);
+    info.frames[0].baked = true;
+    info.frames[0].camera = MatricesOf(*camera, info.spec.film);
     FP_ASSIGN_OR_RETURN(const std::vector<StoredTile> committed, store_->Tiles(id));
     for (const StoredTile& tile : committed) {
       if (tile.tile < info.tiles.size()) info.tiles[tile.tile].sha256 = tile.sha256;

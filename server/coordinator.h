@@ -68,16 +68,30 @@ class CoordinatorApi {
   // --- Jobs ---
   // `submission_id`: a repeated one (not empty) answers with the same job, so that a client may
   // submit again after a lost answer. kFailedPrecondition lists blobs of the asset that are
-  // missing. The job is durable when this returns.
+  // missing, kNotFound names a job of spec.after that is not known. The job is durable when this
+  // returns.
   virtual absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) = 0;
   virtual absl::StatusOr<JobStatus> Status(const JobId& job) = 0;
   virtual std::vector<JobStatus> Jobs() = 0;  // in the order of submission
   virtual std::vector<WorkerStatus> Workers() = 0;
   // Harmless if the job has ended.
   virtual absl::Status Cancel(const JobId& job) = 0;
+  // A paused job leases no tile and starts no bake; what is in work is finished and kept. Durable
+  // when it returns. Harmless if the job is paused already, or has ended.
+  virtual absl::Status Pause(const JobId& job) = 0;
+  virtual absl::Status Resume(const JobId& job) = 0;
+  // kInvalidArgument beyond kMinPriority..kMaxPriority. Decides about the next lease and bake.
+  virtual absl::Status SetPriority(const JobId& job, int32_t priority) = 0;
+  // A failed or cancelled job goes on where it was: committed tiles stay, failures are forgotten, a
+  // pause too. `all`: committed tiles are rendered again, also those of a job that is done or in
+  // work. A job in work only forgets its failures. kFailedPrecondition if a job that this one waits
+  // for has not ended well: requeue that one first.
+  virtual absl::Status Requeue(const JobId& job, bool all) = 0;
+  virtual absl::StatusOr<Explanation> Explain(const JobId& job) = 0;
   // Events with sequence > `after_sequence`, in order, at most 256. Waits up to `wait` for one; if
-  // none comes, a single passing report of progress (sequence 0). The last event of a job is its
-  // final JobState; asking for what follows it answers with an empty list at once.
+  // none comes, a single passing report of progress (sequence 0). Once a job has ended and all its
+  // events are told, the answer is an empty list at once. Its final JobState is then among them; it
+  // is the last one unless a late result was refused after it. A requeued job goes on telling.
   virtual absl::StatusOr<std::vector<JobEvent>> NextEvents(const JobId& job,
                                                            uint64_t after_sequence,
                                                            std::chrono::milliseconds wait) = 0;
@@ -104,7 +118,8 @@ class CoordinatorApi {
 
 // What a caller may want to log. From any thread; the callee must not call the coordinator.
 struct CoordinatorLogEntry {
-  enum class Level { kInfo, kWarning, kError } level = Level::kInfo;
+  using Level = LogLevel;
+  Level level = Level::kInfo;
   std::string text;
   JobId job;  // may be empty
   std::optional<uint32_t> tile;

@@ -47,6 +47,31 @@ class JobServiceImpl final : public v1::JobService::Service {
     return ToGrpc(coordinator_.Cancel({request->job_id()}));
   }
 
+  grpc::Status Pause(grpc::ServerContext*, const v1::PauseRequest* request,
+                     v1::PauseResponse*) override {
+    return ToGrpc(coordinator_.Pause({request->job_id()}));
+  }
+  grpc::Status Resume(grpc::ServerContext*, const v1::ResumeRequest* request,
+                      v1::ResumeResponse*) override {
+    return ToGrpc(coordinator_.Resume({request->job_id()}));
+  }
+  grpc::Status SetPriority(grpc::ServerContext*, const v1::SetPriorityRequest* request,
+                           v1::SetPriorityResponse*) override {
+    return ToGrpc(coordinator_.SetPriority({request->job_id()}, request->priority()));
+  }
+  grpc::Status Requeue(grpc::ServerContext*, const v1::RequeueRequest* request,
+                       v1::RequeueResponse*) override {
+    return ToGrpc(coordinator_.Requeue({request->job_id()}, request->all()));
+  }
+  grpc::Status Explain(grpc::ServerContext*, const v1::ExplainRequest* request,
+                       v1::ExplainResponse* response) override {
+    return ToGrpc([&]() -> absl::Status {
+      FP_ASSIGN_OR_RETURN(const Explanation explanation, coordinator_.Explain({request->job_id()}));
+      *response = ToWire(explanation);
+      return absl::OkStatus();
+    }());
+  }
+
   grpc::Status Watch(grpc::ServerContext* context, const v1::WatchRequest* request,
                      grpc::ServerWriter<v1::JobEvent>* stream) override {
     return ToGrpc([&]() -> absl::Status {

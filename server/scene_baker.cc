@@ -30,7 +30,7 @@ class CoreBaker final : public SceneBaker {
     const TimePoint start = clock.Now();
     const double cpu_start = ThreadCpuSeconds();
     FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, options));
-    ApplyOverrides(spec.overrides, imported.scene);
+    FP_RETURN_IF_ERROR(ApplyOverrides(spec.overrides, asset, imported.scene));
     result.made_up_camera = imported.scene.cameras.empty();
     EnsureCameraAndLight(imported);
     constexpr auto kImport = static_cast<size_t>(Stage::kImport);
@@ -74,6 +74,8 @@ Digest BakeKey(const JobSpec& spec) {
   const RenderSettings any;
   if (s.integrator != Integrator::kPt) s.integrator = any.integrator;
   s.spp = any.spp;
+  s.filter = any.filter;
+  s.filter_width_px = any.filter_width_px;
   s.paths = any.paths;
   s.microbuffer = any.microbuffer;
   s.buffer_map = any.buffer_map;

@@ -55,12 +55,14 @@ absl::StatusOr<std::shared_ptr<const RenderedScene>> TileRunner::SceneOf(
 absl::StatusOr<TileResult> TileRunner::Run(const TileWork& work, TileProgress& progress,
                                            const std::atomic<bool>& cancel) {
   Stats stats;
-  if (frame_ == nullptr || frame_job_ != work.job || !(frame_blobs_ == work.blobs)) {
+  if (frame_ == nullptr || frame_job_ != work.job || frame_index_ != work.frame_index ||
+      !(frame_blobs_ == work.blobs)) {
     frame_.reset();
     frame_scene_.reset();
     FP_ASSIGN_OR_RETURN(frame_scene_, SceneOf(work.blobs, progress, cancel, stats));
     FP_ASSIGN_OR_RETURN(frame_, frame_scene_->StartFrame(work.frame));
     frame_job_ = work.job;
+    frame_index_ = work.frame_index;
     frame_blobs_ = work.blobs;
   }
   if (cancel.load()) return absl::CancelledError("the tile was dropped");

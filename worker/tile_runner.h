@@ -49,6 +49,7 @@ class TileRunner {
   std::list<CachedScene> scenes_;  // most recently used first
   // The frame of the last tile; its scene stays alive with it.
   JobId frame_job_;
+  uint32_t frame_index_ = 0;
   SceneBlobs frame_blobs_;
   std::shared_ptr<const RenderedScene> frame_scene_;
   std::unique_ptr<RenderedFrame> frame_;

@@ -48,6 +48,26 @@ JobSpec FullJob() {
   job.limits.max_pixels = 1000000;
   job.title = "a title";
   job.priority = -5;
+  job.overrides.lights = {{.name = "lamp",
+                           .kind = PunctualKind::kSpot,
+                           .position = {1, 2, 3},
+                           .direction = {0, -1, 0},
+                           .intensity = {4, 5, 6},
+                           .range_m = 7,
+                           .inner_cone_rad = 0.1,
+                           .outer_cone_rad = 0.3}};
+  job.asset_files["env/sky.exr"] = DigestOf("sky");
+  job.overrides.environment = EnvironmentOverride{
+      .uri = "env/sky.exr", .scale = {2, 3, 4}, .rotation_deg = -30, .up = {0, 0, 1}};
+  job.overrides.materials = {{.name = "wall", .base_color = Rgb(0.1f, 0.2f, 0.3f)},
+                             {.name = "lamp", .emission = Rgb(7, 8, 9)},
+                             {.name = "neither"}};
+  job.settings.filter = PixelFilter::kGaussian;
+  job.settings.filter_width_px = 2.5f;
+  job.frames = {7, 9};
+  job.fps = 29.97;
+  job.after = {{"00000001"}, {"00000002"}};
+  job.start_paused = true;
   return job;
 }
 
@@ -343,9 +363,12 @@ TEST(Convert, JobInfoSurvivesTheWireAndKeepsTilesInsideTheCrop) {
   info.status.id = {"0123abcd"};
   info.spec = FullJob();
   info.tiles = {{.rect = {10, 20, 64, 64}, .sha256 = DigestOf("t")}, {.rect = {64, 20, 128, 64}}};
-  info.camera.world_to_camera[3] = 4;
+  info.frames.resize(2);
+  info.frames[0] = {.number = 7, .baked = true, .blobs = {DigestOf("s"), {}, {}}};
+  info.frames[0].camera.world_to_camera[3] = 4;
+  info.frames[1].number = 9;
+  info.tiles[1].frame = 1;
   info.notes = {"a note"};
-  info.blobs = {DigestOf("s"), {}, {}};
   info.version = "1";
   const v1::FetchInfoResponse wire = ToWire(info);
   const absl::StatusOr<JobInfo> back = JobInfoFromWire(wire);
@@ -355,11 +378,14 @@ TEST(Convert, JobInfoSurvivesTheWireAndKeepsTilesInsideTheCrop) {
   const std::vector<std::function<void(v1::FetchInfoResponse&)>> cases = {
       [](auto& w) { w.mutable_tiles(0)->mutable_rect()->set_x0(9); },
       [](auto& w) { w.mutable_tiles(0)->set_sha256("x"); },
-      [](auto& w) { w.mutable_camera()->add_world_to_ndc(1); },
-      [](auto& w) { w.mutable_camera()->set_world_to_ndc(0, kNan); },
+      [](auto& w) { w.mutable_frames(0)->mutable_camera()->add_world_to_ndc(1); },
+      [](auto& w) { w.mutable_frames(0)->mutable_camera()->set_world_to_ndc(0, kNan); },
+      [](auto& w) { w.mutable_tiles(1)->set_frame(2); },
+      [](auto& w) { w.mutable_frames()->RemoveLast(); },
+      [](auto& w) { w.add_frames(); },
       [](auto& w) { w.mutable_job()->mutable_asset()->clear_files(); },
       [](auto& w) { w.mutable_job()->clear_film(); },
-      [](auto& w) { w.mutable_blobs()->clear_prepared_scene(); },
+      [](auto& w) { w.mutable_frames(0)->mutable_blobs()->clear_prepared_scene(); },
   };
   for (size_t i = 0; i < cases.size(); ++i) {
     v1::FetchInfoResponse spoiled = wire;

@@ -96,7 +96,7 @@ TEST(Job, OverridesReplaceLightSkyAndAlbedo) {
   overrides.suns = {{.to_sun = {0, 2, 0}, .irradiance = {1, 2, 3}}};
   overrides.sky = Rgb(4, 5, 6);
   overrides.albedo = Rgb(0.25f, 0.5f, 0.75f);
-  ApplyOverrides(overrides, scene);
+  ASSERT_TRUE(ApplyOverrides(overrides, {}, scene).ok());
   ASSERT_EQ(scene.lights.size(), 1u);
   EXPECT_EQ(scene.lights[0].kind, PunctualKind::kDirectional);
   EXPECT_EQ(scene.lights[0].direction, Vec3d(-0.0, -1, -0.0));
@@ -113,7 +113,7 @@ TEST(Job, NoOverrideChangesNothing) {
   Scene scene;
   scene.lights.resize(3);
   scene.meshes.resize(1);
-  ApplyOverrides({}, scene);
+  ASSERT_TRUE(ApplyOverrides({}, {}, scene).ok());
   EXPECT_EQ(scene.lights.size(), 3u);
   EXPECT_EQ(scene.meshes[0].material, -1);
   EXPECT_TRUE(scene.materials.empty());
