@@ -1,34 +1,63 @@
 #include "core/scene/asset.h"
 
 #include <filesystem>
+#include <system_error>
 #include <utility>
-#include <vector>
 
+#include "core/scene/asset_source.h"
 #include "core/scene/gltf_check.h"
+#include "core/scene/obj_importer.h"
 #include "core/scene/scene_format.h"
 
 namespace farpoint {
 
 namespace {
 
-// A file that the main file refers to, and where.
-struct Reference {
-  std::string uri;
-  std::string place;
+// Files in a folder of this machine, kept as they are read.
+class FolderSource : public AssetSource {
+ public:
+  FolderSource(std::filesystem::path folder, std::map<std::string, Blob>& files)
+      : folder_(std::move(folder)), files_(files) {}
+
+  bool Has(const std::string& uri) override {
+    std::error_code error;
+    return files_.count(uri) != 0 || std::filesystem::is_regular_file(folder_ / uri, error);
+  }
+  absl::StatusOr<Blob> Read(const std::string& uri) override {
+    if (const auto it = files_.find(uri); it != files_.end()) return it->second;
+    FP_ASSIGN_OR_RETURN(Blob blob, ReadFile((folder_ / uri).string()));
+    files_.emplace(uri, blob);
+    return blob;
+  }
+
+ private:
+  std::filesystem::path folder_;
+  std::map<std::string, Blob>& files_;
 };
 
-absl::StatusOr<std::vector<Reference>> ListReferences(const std::string& root, const Blob& file) {
+// Reads all that the main file refers to.
+absl::Status ReadReferences(const std::string& path, const std::string& root, const Blob& file,
+                            AssetSource& source) {
   FP_ASSIGN_OR_RETURN(const SceneFormat format, SceneFormatOf(root));
-  std::vector<Reference> references;
   switch (format) {
     case SceneFormat::kGltf: {
       FP_ASSIGN_OR_RETURN(const GltfContainer container, OpenGltfContainer(root, file));
-      FP_ASSIGN_OR_RETURN(auto list, ListGltfReferences(root, container));
-      for (auto& r : list) references.push_back({std::move(r.uri), std::move(r.place)});
-      break;
+      FP_ASSIGN_OR_RETURN(const auto references, ListGltfReferences(root, container));
+      for (const GltfReference& reference : references) {
+        const auto blob = source.Read(reference.uri);
+        if (blob.ok()) continue;
+        return absl::Status(blob.status().code(), path + ": " + reference.place + ": " +
+                                                      std::string(blob.status().message()) +
+                                                      "; put the file beside the scene");
+      }
+      return absl::OkStatus();
     }
+    case SceneFormat::kObj:
+      return VisitObjReferences(root, file, source);
+    case SceneFormat::kPly:
+      return absl::OkStatus();  // one file
   }
-  return references;
+  return absl::InternalError("unknown scene format");
 }
 
 }  // namespace
@@ -45,20 +74,10 @@ absl::StatusOr<AssetBundle> CollectAsset(const std::string& path) {
   AssetBundle bundle;
   bundle.root = main_path.filename().string();
   FP_RETURN_IF_ERROR(SceneFormatOf(bundle.root).status());
-  FP_ASSIGN_OR_RETURN(Blob main_file, ReadFile(path));
-  FP_ASSIGN_OR_RETURN(const auto references, ListReferences(bundle.root, main_file));
-  bundle.files.emplace(bundle.root, std::move(main_file));
-  for (const Reference& reference : references) {
-    if (bundle.files.count(reference.uri) != 0) continue;
-    auto file = ReadFile((main_path.parent_path() / reference.uri).string());
-    if (!file.ok()) {
-      const absl::Status& status = file.status();
-      return absl::Status(status.code(), path + ": " + reference.place + ": " +
-                                             std::string(status.message()) +
-                                             "; put the file beside the scene");
-    }
-    bundle.files.emplace(reference.uri, *std::move(file));
-  }
+  FP_ASSIGN_OR_RETURN(const Blob main_file, ReadFile(path));
+  bundle.files.emplace(bundle.root, main_file);
+  FolderSource source(main_path.parent_path(), bundle.files);
+  FP_RETURN_IF_ERROR(ReadReferences(path, bundle.root, main_file, source));
   return bundle;
 }
 

@@ -1,7 +1,10 @@
 #include "core/scene/image_decode.h"
 
+#include <algorithm>
+#include <array>
 #include <cstdlib>
 #include <cstring>
+#include <utility>
 
 namespace {
 
@@ -47,6 +50,64 @@ const stbi_uc* DataOf(std::span<const std::byte> bytes) {
   return reinterpret_cast<const stbi_uc*>(bytes.data());
 }
 
+constexpr size_t kMaxStoredBlock = 65535;
+
+std::array<uint32_t, 256> MakeCrcTable() {
+  std::array<uint32_t, 256> table{};
+  for (uint32_t i = 0; i < 256; ++i) {
+    uint32_t crc = i;
+    for (int k = 0; k < 8; ++k) crc = (crc >> 1) ^ (0xedb88320u & (0u - (crc & 1)));
+    table[i] = crc;
+  }
+  return table;
+}
+
+// Chunks with their CRC (PNG specification, section 5.3).
+class PngWriter {
+ public:
+  PngWriter() {
+    for (const int byte : std::array<int, 8>{0x89, 80, 78, 71, 13, 10, 26, 10}) {  // "\x89PNG\r\n\x1a\n"
+      Push(static_cast<uint8_t>(byte));
+    }
+  }
+  void BeginChunk(const char* type, size_t size) {
+    bytes_.reserve(bytes_.size() + size + 12);
+    BigEndian(static_cast<uint32_t>(size));
+    crc_ = 0xffffffff;
+    for (int i = 0; i < 4; ++i) Byte(static_cast<uint8_t>(type[i]));
+  }
+  void EndChunk() { BigEndian(~crc_); }
+  void Byte(uint8_t byte) {
+    static const std::array<uint32_t, 256> kCrc = MakeCrcTable();
+    crc_ = (crc_ >> 8) ^ kCrc[(crc_ ^ byte) & 255];
+    Push(byte);
+  }
+  void BigEndian(uint32_t v) {
+    for (const int shift : {24, 16, 8, 0}) Byte(static_cast<uint8_t>(v >> shift));
+  }
+  std::vector<std::byte> TakeBytes() { return std::move(bytes_); }
+
+ private:
+  void Push(uint8_t byte) { bytes_.push_back(std::byte{byte}); }
+
+  std::vector<std::byte> bytes_;
+  uint32_t crc_ = 0;
+};
+
+class Adler32 {
+ public:
+  void Add(std::span<const uint8_t> bytes) {
+    for (const uint8_t byte : bytes) {
+      a_ = (a_ + byte) % 65521;
+      b_ = (b_ + a_) % 65521;
+    }
+  }
+  uint32_t value() const { return b_ << 16 | a_; }
+
+ private:
+  uint32_t a_ = 1, b_ = 0;
+};
+
 }  // namespace
 
 absl::StatusOr<ImageSize> ReadImageSize(const std::string& name, std::span<const std::byte> bytes) {
@@ -88,6 +149,43 @@ absl::StatusOr<DecodedImage> DecodeImage(const std::string& name,
   std::memcpy(image.texels.data(), decoded, image.texels.size() * sizeof(uint32_t));
   stbi_image_free(decoded);
   return image;
+}
+
+Blob EncodePng(const DecodedImage& image) {
+  PngWriter png;
+  png.BeginChunk("IHDR", 13);
+  png.BigEndian(image.width);
+  png.BigEndian(image.height);
+  for (const int byte : {8, 6, 0, 0, 0})
+    png.Byte(static_cast<uint8_t>(byte));  // 8-bit RGBA, not interlaced
+  png.EndChunk();
+  // Stored blocks of deflate (RFC 1951, 3.2.4), one for each row; a row of the largest image has
+  // 65,537 bytes, so it may take two.
+  const size_t row_bytes = 1 + size_t{image.width} * 4;
+  const size_t blocks_per_row = (row_bytes + kMaxStoredBlock - 1) / kMaxStoredBlock;
+  png.BeginChunk("IDAT", 2 + image.height * (row_bytes + 5 * blocks_per_row) + 4);
+  png.Byte(0x78);
+  png.Byte(0x01);
+  Adler32 adler;
+  std::vector<uint8_t> row(row_bytes);
+  for (uint32_t y = 0; y < image.height; ++y) {
+    std::memcpy(row.data() + 1, &image.texels[size_t{y} * image.width], row_bytes - 1);
+    adler.Add(row);
+    for (size_t at = 0; at < row_bytes; at += kMaxStoredBlock) {
+      const size_t size = std::min(kMaxStoredBlock, row_bytes - at);
+      png.Byte(y + 1 == image.height && at + size == row_bytes ? 1 : 0);
+      png.Byte(static_cast<uint8_t>(size & 255));
+      png.Byte(static_cast<uint8_t>(size >> 8));
+      png.Byte(static_cast<uint8_t>(~size & 255));
+      png.Byte(static_cast<uint8_t>(~size >> 8 & 255));
+      for (size_t i = at; i < at + size; ++i) png.Byte(row[i]);
+    }
+  }
+  png.BigEndian(adler.value());
+  png.EndChunk();
+  png.BeginChunk("IEND", 0);
+  png.EndChunk();
+  return Blob::FromVector(png.TakeBytes());
 }
 
 }  // namespace farpoint

@@ -1,4 +1,4 @@
-// Encoded images to texels.
+// Encoded images to texels, and back.
 #pragma once
 
 #include <cstddef>
@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "core/base/blob.h"
 #include "core/base/status.h"
 
 namespace farpoint {
@@ -29,5 +30,8 @@ absl::StatusOr<ImageSize> ReadImageSize(const std::string& name, std::span<const
 // it cannot be read, or that it is larger than kMaxImageSide on a side or 2^27 texels. Memory is
 // bounded by the size that the image's header declares, whatever its data inflates to.
 absl::StatusOr<DecodedImage> DecodeImage(const std::string& name, std::span<const std::byte> bytes);
+
+// An RGBA PNG of the same texels, not compressed: for images that exist only for a short while.
+Blob EncodePng(const DecodedImage& image);
 
 }  // namespace farpoint

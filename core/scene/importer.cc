@@ -5,6 +5,8 @@
 
 #include "core/math/elementary.h"
 #include "core/scene/gltf_importer.h"
+#include "core/scene/obj_importer.h"
+#include "core/scene/ply_importer.h"
 #include "core/scene/scene_format.h"
 
 namespace farpoint {
@@ -61,6 +63,10 @@ absl::StatusOr<ImportedScene> ImportScene(const AssetBundle& asset, const Import
   switch (format) {
     case SceneFormat::kGltf:
       return ImportGltf(asset, options);
+    case SceneFormat::kObj:
+      return ImportObj(asset, options);
+    case SceneFormat::kPly:
+      return ImportPly(asset, options);
   }
   return absl::InternalError("unknown scene format");
 }

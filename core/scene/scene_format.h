@@ -7,7 +7,7 @@
 
 namespace farpoint {
 
-enum class SceneFormat { kGltf };  // .gltf and .glb
+enum class SceneFormat { kGltf, kObj, kPly };  // kGltf: .gltf and .glb
 
 // By the extension, in any case. kInvalidArgument names the file and the extensions that are known.
 absl::StatusOr<SceneFormat> SceneFormatOf(const std::string& file_name);
