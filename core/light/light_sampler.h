@@ -1,8 +1,9 @@
-// Direct light: what arrives at a point straight from emitters and from the sky. One estimator
-// for surfels, receivers and path hits, so that the integrators differ in the gather only.
+// Direct light: what arrives at a point straight from emitters and from the environment. One
+// estimator for surfels, receivers and path hits, so that the integrators differ in the gather
+// only (docs/lights.md).
 //
 //   E(p, n) = Σ_punctual V I f cosθ / d²  +  ∫_emitters V L_e cosθ cosθ_l / d² dA
-//             + ∫_sky V L_sky cosθ dω
+//             + ∫_environment V L cosθ dω
 #pragma once
 
 #include <cstdint>
@@ -11,6 +12,8 @@
 #include <vector>
 
 #include "core/accel/ray_accel.h"
+#include "core/light/environment_sampler.h"
+#include "core/light/light_tree.h"
 #include "core/math/vec.h"
 
 namespace farpoint {
@@ -18,8 +21,9 @@ namespace farpoint {
 // Which shadow rays an estimate took and saved.
 struct LightCounters {
   uint64_t rays = 0;
-  uint64_t samples = 0;              // points drawn on emitters
-  uint64_t skipped_facing_away = 0;  // light behind the surface or out of its range or cone
+  uint64_t samples = 0;              // lights, points on emitters, directions of the map drawn
+  uint64_t skipped_facing_away = 0;  // nothing arrives unshadowed: behind the surface, out of range
+                                     // or cone, seen edge-on, or a hole
 };
 
 // Immutable; thread-safe.
@@ -27,33 +31,58 @@ class LightSampler {
  public:
   explicit LightSampler(std::shared_ptr<const RayAccel> accel);
 
+  // Up to so many punctual lights all have a ray, however few samples are asked for.
+  static constexpr uint32_t kFewLights = 8;
+
   // False if nothing in the scene sends light: no irradiance anywhere, no gather needed.
   bool any_light() const { return any_light_; }
   bool has_emitters() const { return !emitters_.empty(); }
-  bool has_sky() const { return has_sky_; }
+  bool has_sky() const { return has_sky_; }  // a constant one or a map
 
   // An unbiased estimate of the irradiance [W/m²] at surface point `p` (relative to the scene's
   // origin) on the side of unit geometric normal `ng`, against shading normal `n`
-  // (Dot(n, ng) >= 0): `samples` >= 1 shadow rays to the emitters, chosen by power, then by solid
-  // angle, and stratified (Owen-scrambled Sobol' in two dimensions), `samples` to the sky by the
-  // cosine, one to each punctual light. Holes of alpha masks emit nothing. What lies within two
-  // surface offsets of an emitter's plane does not shadow it. `first_index` is the index of the
-  // first sample within its sequence and `key` names the sequence: the same key with disjoint
-  // aligned index ranges gives one stratified set. `dimension` (0 or 2) is the first of the two
-  // Sobol' dimensions used: a caller whose own choices for the same index take dimensions 0 and 1
-  // passes 2, or the two would be correlated.
+  // (Dot(n, ng) >= 0).
+  // - Emitters: `samples` >= 1 shadow rays to points drawn by a light tree, then by solid angle.
+  // - Point and spot lights: one ray each if there are up to max(samples, kFewLights) of them, else
+  //   `samples` rays to lights drawn by another tree. Directional lights: the same with their own
+  //   number, drawn by their unshadowed irradiance, at a cost (without rays) of their number.
+  // - Environment: `samples` rays, by the cosine if it is a constant sky, else by
+  //   EnvironmentSampler.
+  // Each of these is stratified (Owen-scrambled Sobol' in two dimensions). Holes of alpha masks
+  // emit nothing. What lies within two surface offsets of an emitter's plane does not shadow it.
+  // `first_index` is the index of the first sample within its sequence and `key` names the
+  // sequence: the same key with disjoint aligned index ranges gives one stratified set.
+  // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
+  // for the same index take dimensions 0 and 1 passes 2, or the two would be correlated.
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
                  uint32_t first_index, unsigned dimension, LightCounters& counters) const;
 
  private:
+  // What an estimate is made for.
+  struct Query {
+    Vec3f p, ng, n;
+    Vec3f origin;  // of its shadow rays
+    uint32_t samples;
+    uint64_t key;
+    uint32_t first_index;
+    unsigned dimension;
+  };
   struct Emitter {
     Vec3f v0, e1, e2;  // a vertex and the two edges from it
     Vec3f normal;      // unit
     uint32_t triangle;
     float area_m2;
-    float probability;  // of being chosen
-    float cdf_below;    // sum of the probabilities before it
-    bool varies;        // its radiance is textured or it has holes
+    bool varies;  // its radiance is textured or it has holes
+  };
+  // Eight emitters side by side: their corners, and what their weight is made of. Empty places
+  // have power 0.
+  struct alignas(32) EmitterBlock {
+    LightTree::Weights a[3], b[3], c[3], normal[3];
+    LightTree::Weights twice_area, luminance;
+  };
+  // Eight point or spot lights.
+  struct alignas(32) PunctualBlock {
+    LightTree::Weights position[3], direction[3], luminance, range, cos_inner, cos_outer;
   };
 
   // A direction to a point of an emitter, as drawn.
@@ -67,8 +96,30 @@ class LightSampler {
   // (u, v) in [0, 1)² -> a direction from p; none where the emitter is seen edge-on.
   std::optional<EmitterPoint> SamplePoint(const Emitter& e, const Vec3f& p, float u, float v) const;
 
+  void AddEmitters();
+  void AddPunctualLights();
+  static void Weigh(const EmitterBlock& block, const Vec3f& p, const Vec3f& n,
+                    LightTree::Weights& weights);
+  static void Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f& n,
+                    LightTree::Weights& weights);
+  // What one light adds; counts its ray.
+  Rgb FromPunctual(const PreparedLight& light, const Query& q, LightCounters& counters) const;
+  Rgb FromPunctualLights(const Query& q, LightCounters& counters) const;
+  Rgb FromManyDirectional(const Query& q, LightCounters& counters) const;
+  Rgb FromEmitters(const Query& q, LightCounters& counters) const;
+  Rgb FromSky(const Query& q, LightCounters& counters) const;
+  Rgb FromMap(const Query& q, LightCounters& counters) const;
+
   std::shared_ptr<const RayAccel> accel_;
-  std::vector<Emitter> emitters_;
+  std::vector<Emitter> emitters_;  // by place in the tree's order; empty places have area 0
+  std::vector<EmitterBlock> emitter_blocks_;
+  LightTree emitter_tree_;
+  // Those with power; the positioned ones by place in the tree's order, empty places black.
+  std::vector<PreparedLight> directional_lights_, positioned_lights_;
+  uint32_t positioned_count_ = 0;
+  std::vector<PunctualBlock> punctual_blocks_;
+  LightTree punctual_tree_;
+  std::unique_ptr<const EnvironmentSampler> environment_;
   bool has_sky_ = false;
   bool any_light_ = false;
 };

@@ -1,0 +1,142 @@
+// A light tree (Conty Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive
+// Tree Splitting"; bounds of light as in pbrt, 4th edition, 12.6.3) of eight children a node, so
+// that one step looks three binary levels ahead. Its leaves are blocks of up to eight lights, which
+// the caller weighs himself, as exactly as he likes.
+//
+// A light is bounded by a box, a cone of directions and a power. What a node may send to a point:
+//   power cosθ_receiver cosθ_emitter / d²,
+// each cosine the largest that sphere and cone allow, d² at least what the node's own size is. It
+// is 0 only where nothing can arrive.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <limits>
+#include <optional>
+#include <span>
+#include <vector>
+
+#include "core/math/vec.h"
+
+namespace farpoint {
+
+struct LightBounds {
+  Box3f box;
+  // The cone of normals (kTwoSidedCosine) or of directions of emission (kCone): unit axis and
+  // cosine of the half angle; -1: all directions.
+  Vec3f axis{0, 0, 1};
+  float cos_cone = -1;
+  float power = 0;  // > 0; in any unit common to the tree, at most 2^120
+  float reach_m = std::numeric_limits<float>::infinity();  // sends nothing farther than that
+};
+
+// Immutable; thread-safe.
+class LightTree {
+ public:
+  static constexpr uint32_t kWidth = 8;
+  static constexpr uint32_t kNone = ~0u;
+  enum class Emission {
+    kTwoSidedCosine,  // Lambertian surfaces that emit from both sides
+    kCone,            // the same in all directions of the cone
+  };
+  using Weights = std::array<float, kWidth>;
+
+  LightTree() = default;  // empty: there is nothing to choose
+  // O(n log n). The tree is a function of the lights in their order; scaling all lengths by a power
+  // of two changes nothing.
+  LightTree(std::span<const LightBounds> lights, Emission emission);
+
+  bool empty() const { return order_.empty(); }
+  // Block b of lights: indices order()[8 b] to order()[8 b + 7], the last ones kNone where the
+  // block has fewer.
+  std::span<const uint32_t> order() const { return order_; }
+
+  // Weights of nodes and blocks for one point, kept while draws are made for it.
+  class Cache {
+   public:
+    Cache() { key_.fill(kNone); }
+
+   private:
+    friend class LightTree;
+    static constexpr uint32_t kSlots = 32;
+    std::array<uint32_t, kSlots> key_;
+    alignas(32) std::array<Weights, kSlots> weight_;
+  };
+  struct Choice {
+    uint32_t place;      // index into order()
+    double probability;  // > 0
+  };
+  // Draws a light for the point `p` with normal `n` by u in [0, 1), which becomes the place within
+  // what was chosen, again in [0, 1). `cache` was used for no other point and normal.
+  // `block_weights(b, weights)` sets the weights (finite, >= 0; 0 for an empty place) of block b,
+  // always the same for one p and n. None if nothing can arrive.
+  template <typename BlockWeights>
+  std::optional<Choice> Choose(const Vec3f& p, const Vec3f& n, double& u, Cache& cache,
+                               const BlockWeights& block_weights) const;
+
+ private:
+  struct alignas(32) Node {
+    Weights x, y, z, radius;  // bounding spheres of the children
+    Weights axis_x, axis_y, axis_z, cos_cone, sin_cone;
+    Weights power, reach;                // 0: no child
+    std::array<uint32_t, kWidth> child;  // a node, or kBlock + a block
+  };
+  static constexpr uint32_t kBlock = 1u << 31;
+
+  uint32_t Build(std::span<const LightBounds> lights, std::span<uint32_t> items, unsigned depth,
+                 LightBounds& bounds);
+  void NodeWeights(const Node& node, const Vec3f& p, const Vec3f& n, Weights& weights) const;
+
+  Emission emission_ = Emission::kCone;
+  uint32_t root_ = kNone;
+  std::vector<Node> nodes_;
+  std::vector<uint32_t> order_;
+};
+
+template <typename BlockWeights>
+std::optional<LightTree::Choice> LightTree::Choose(const Vec3f& p, const Vec3f& n, double& u,
+                                                   Cache& cache,
+                                                   const BlockWeights& block_weights) const {
+  constexpr double kBelowOne = 1.0 - 0x1p-53;
+  double probability = 1;
+  uint32_t at = root_;
+  if (at == kNone) return std::nullopt;
+  for (;;) {
+    const bool is_block = (at & kBlock) != 0;
+    const uint32_t index = at & ~kBlock;
+    const uint32_t slot = (2 * index + (is_block ? 1 : 0)) % Cache::kSlots;
+    Weights& weight = cache.weight_[slot];
+    if (cache.key_[slot] != at) {
+      cache.key_[slot] = at;
+      if (is_block) {
+        block_weights(index, weight);
+      } else {
+        NodeWeights(nodes_[index], p, n, weight);
+      }
+    }
+    double total = 0;
+    for (const float w : weight) total += static_cast<double>(w);
+    if (!(total > 0)) return std::nullopt;
+    double x = u * total;
+    // The last child with a weight takes what rounding leaves.
+    uint32_t chosen = kNone;
+    double before = 0, below = 0;
+    for (uint32_t k = 0; k < kWidth; ++k) {
+      const auto w = static_cast<double>(weight[k]);
+      if (!(w > 0)) continue;
+      chosen = k;
+      before = below;
+      below += w;
+      if (x < below) break;
+    }
+    const auto w = static_cast<double>(weight[chosen]);
+    u = x - before;
+    u = u > 0 ? u / w : 0.0;
+    if (u > kBelowOne) u = kBelowOne;
+    probability *= w / total;
+    if (is_block) return Choice{index * kWidth + chosen, probability};
+    at = nodes_[index].child[chosen];
+  }
+}
+
+}  // namespace farpoint
