@@ -53,7 +53,7 @@ absl::Status ReadReferences(const std::string& path, const std::string& root, co
       return absl::OkStatus();
     }
     case SceneFormat::kObj:
-      return VisitObjReferences(root, file, source);
+      return VisitObjReferences(path, file, source);
     case SceneFormat::kPly:
       return absl::OkStatus();  // one file
   }

@@ -3,6 +3,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
 #include <initializer_list>
 #include <limits>
@@ -26,9 +27,36 @@ constexpr uint64_t kMaxImplicitCount = uint64_t{1} << 24;
 // Levels of objects and arrays; tinygltf reads extras by recursion.
 constexpr int kMaxJsonDepth = 128;
 
-constexpr const char* kSupportedExtensions[] = {"KHR_lights_punctual",
-                                                "KHR_materials_emissive_strength",
-                                                "KHR_texture_transform", "KHR_mesh_quantization"};
+// Keyframes that the channels of all animations read together.
+constexpr uint64_t kMaxKeyframes = uint64_t{1} << 26;
+
+constexpr const char* kSupportedExtensions[] = {
+    "KHR_lights_punctual",     "KHR_materials_emissive_strength",
+    "KHR_texture_transform",   "KHR_mesh_quantization",
+    "EXT_mesh_gpu_instancing", "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_variants"};
+
+// What to do about extensions that files require and that are not supported.
+struct Advice {
+  const char *extension, *text;
+};
+constexpr Advice kAdvice[] = {
+    {"KHR_draco_mesh_compression", "decompress it, as with 'gltf-transform copy IN OUT'"},
+    {"EXT_meshopt_compression", "decompress it, as with 'gltf-transform copy IN OUT'"},
+    {"KHR_meshopt_compression", "decompress it, as with 'gltf-transform copy IN OUT'"},
+    {"KHR_texture_basisu",
+     "convert its textures to PNG or JPEG, as with 'gltf-transform png IN OUT'"},
+    {"EXT_texture_webp",
+     "convert its textures to PNG or JPEG, as with 'gltf-transform png IN OUT'"},
+    {"EXT_texture_avif",
+     "convert its textures to PNG or JPEG, as with 'gltf-transform png IN OUT'"}};
+
+std::string AdviceFor(const std::string& extension) {
+  for (const Advice& advice : kAdvice) {
+    if (extension == advice.extension) return advice.text;
+  }
+  return "export the scene without it";
+}
 
 // What tinygltf decodes.
 constexpr const char* kDataUriHeads[] = {"data:application/octet-stream;base64,",
@@ -87,11 +115,13 @@ absl::Status ReadUnsigned(const Place& parent, const char* key, uint64_t max,
   const Place place(parent, key, *value);
   if (!value->is_number_integer()) return WrongType(place, "an integer");
   if (!value->is_number_unsigned() && value->get<int64_t>() < 0) {
-    return place.Fail("is " + std::to_string(value->get<int64_t>()) + ", less than 0");
+    return place.Fail("is " + std::to_string(value->get<int64_t>()) + ", outside of [0, " +
+                      std::to_string(max) + "]");
   }
   const uint64_t number = value->get<uint64_t>();
   if (number > max) {
-    return place.Fail("is " + std::to_string(number) + ", more than " + std::to_string(max));
+    return place.Fail("is " + std::to_string(number) + ", outside of [0, " + std::to_string(max) +
+                      "]");
   }
   out = number;
   return absl::OkStatus();
@@ -126,11 +156,19 @@ absl::Status ReadIndex(const Place& parent, const char* key, size_t size, const 
   return absl::OkStatus();
 }
 
+std::string Bound(double bound) {
+  if (bound == std::numeric_limits<double>::min()) return "2.3e-308";
+  char text[32];
+  std::snprintf(text, sizeof(text), "%.7g", bound);
+  return text;
+}
+
 absl::Status CheckNumberValue(const Place& place, double min, double max) {
   if (!place.value().is_number()) return WrongType(place, "a number");
   const double number = place.value().get<double>();
   if (!(number >= min && number <= max)) {
-    return place.Fail("is " + place.value().dump() + ", outside of what is allowed here");
+    return place.Fail("is " + place.value().dump() + ", outside of [" + Bound(min) + ", " +
+                      Bound(max) + "]");
   }
   return absl::OkStatus();
 }
@@ -397,7 +435,10 @@ class Checker {
     FP_RETURN_IF_ERROR(
         ForEachObject(root_, "cameras", [&](const Place& p) { return CheckCamera(p); }));
     FP_RETURN_IF_ERROR(CheckLights());
+    FP_RETURN_IF_ERROR(ForEachObject(root_, "skins", [&](const Place& p) { return CheckSkin(p); }));
     FP_RETURN_IF_ERROR(ForEachObject(root_, "nodes", [&](const Place& p) { return CheckNode(p); }));
+    FP_RETURN_IF_ERROR(
+        ForEachObject(root_, "animations", [&](const Place& p) { return CheckAnimation(p); }));
     FP_RETURN_IF_ERROR(ForEachObject(root_, "scenes", [&](const Place& p) -> absl::Status {
       FP_RETURN_IF_ERROR(CheckString(p, "name"));
       FP_RETURN_IF_ERROR(CheckSky(p));
@@ -448,7 +489,7 @@ class Checker {
         if (!supported) {
           return absl::UnimplementedError(
               name_ + ": " + element.Path() + ": the file requires the extension '" + extension +
-              "', which farpoint does not support; export the scene without it");
+              "', which farpoint does not support; " + AdviceFor(extension));
         }
       }
     }
@@ -702,6 +743,11 @@ class Checker {
       }
     }
     return WithObject(place, "extensions", [&](const Place& extensions) {
+      FP_RETURN_IF_ERROR(WithObject(
+          extensions, "KHR_materials_pbrSpecularGlossiness", [&](const Place& pbr) -> absl::Status {
+            FP_RETURN_IF_ERROR(CheckNumbers(pbr, "diffuseFactor", 4, 0, 1e6));
+            return CheckTextureInfo(pbr, "diffuseTexture");
+          }));
       return WithObject(extensions, "KHR_materials_emissive_strength", [&](const Place& strength) {
         return CheckNumber(strength, "emissiveStrength", 0, 1e12);
       });
@@ -711,6 +757,12 @@ class Checker {
   absl::Status CheckMesh(const Place& place) {
     FP_RETURN_IF_ERROR(CheckString(place, "name"));
     if (place.Find("primitives") == nullptr) return place.Fail("has no 'primitives'");
+    if (const Json* weights = place.Find("weights"); weights != nullptr) {
+      FP_RETURN_IF_ERROR(CheckNumbers(place, "weights", weights->size(), -1e9, 1e9));
+    }
+    // A mesh's morph targets are counted by its first primitive.
+    morph_targets_.push_back(0);
+    bool first = true;
     return ForEachObject(place, "primitives", [&](const Place& primitive) -> absl::Status {
       std::optional<size_t> index;
       std::optional<uint64_t> mode;
@@ -730,13 +782,78 @@ class Checker {
           return indices.Fail(accessor_name + " has no bufferView");
       }
       if (primitive.Find("attributes") == nullptr) return primitive.Fail("has no 'attributes'");
-      return WithObject(primitive, "attributes",
-                        [&](const Place& attributes) { return CheckAttributes(attributes); });
+      std::optional<uint64_t> positions;
+      FP_RETURN_IF_ERROR(WithObject(primitive, "attributes", [&](const Place& attributes) {
+        return CheckAttributes(attributes, positions);
+      }));
+      return CheckTargets(primitive, positions, first);
     });
   }
 
-  absl::Status CheckAttributes(const Place& attributes) {
-    std::optional<uint64_t> positions;
+  absl::Status CheckTargets(const Place& primitive, std::optional<uint64_t> positions,
+                            bool& first) {
+    size_t targets = 0;
+    FP_RETURN_IF_ERROR(
+        ForEachObject(primitive, "targets", [&](const Place& target) -> absl::Status {
+          ++targets;
+          for (const auto& [key, value] : target.value().items()) {
+            const Place place(target, key.c_str(), value);
+            FP_RETURN_IF_ERROR(CheckIndexValue(place, Size("accessors"), "accessors"));
+            const Json& accessor = json_["accessors"][value.get<size_t>()];
+            if (key != "POSITION" && key != "NORMAL") continue;
+            if (accessor["type"] != "VEC3" || accessor["componentType"] == 5125) {
+              return place.Fail("accessor " + value.dump() +
+                                " is not VEC3 of floats or integers of 8 or 16 bits");
+            }
+            const uint64_t count = accessor["count"].get<uint64_t>();
+            if (positions && count != *positions) {
+              return place.Fail("has " + std::to_string(count) + " elements for " +
+                                std::to_string(*positions) + " positions");
+            }
+          }
+          return absl::OkStatus();
+        }));
+    if (first) morph_targets_.back() = targets;
+    first = false;
+    if (targets != morph_targets_.back()) {
+      return primitive.Fail("has " + std::to_string(targets) + " morph targets where the first " +
+                            "primitive of the mesh has " + std::to_string(morph_targets_.back()));
+    }
+    return absl::OkStatus();
+  }
+
+  // An accessor by its index in `place`, of one of the types and component types. Integers other
+  // than the plain ones must be normalised.
+  absl::Status CheckKind(const Place& place, std::initializer_list<const char*> types,
+                         std::initializer_list<int> plain, std::initializer_list<int> normalized,
+                         uint64_t& count) {
+    FP_RETURN_IF_ERROR(CheckIndexValue(place, Size("accessors"), "accessors"));
+    const Json& accessor = json_["accessors"][place.value().get<size_t>()];
+    const int component_type = accessor["componentType"].get<int>();
+    const bool is_normalized = accessor.value("normalized", false);
+    std::string expected;
+    bool type_fits = false, component_fits = false;
+    for (const char* type : types) {
+      type_fits |= accessor["type"] == type;
+      expected += (expected.empty() ? "" : " or ") + std::string(type);
+    }
+    expected += " of componentType";
+    for (const int type : plain) {
+      component_fits |= component_type == type && !is_normalized;
+      expected += " " + std::to_string(type);
+    }
+    for (const int type : normalized) {
+      component_fits |= component_type == type && is_normalized;
+      expected += " " + std::to_string(type) + " (normalized)";
+    }
+    if (!type_fits || !component_fits) {
+      return place.Fail("accessor " + place.value().dump() + " is not " + expected);
+    }
+    count = accessor["count"].get<uint64_t>();
+    return absl::OkStatus();
+  }
+
+  absl::Status CheckAttributes(const Place& attributes, std::optional<uint64_t>& positions) {
     for (const auto& [key, value] : attributes.value().items()) {
       const Place place(attributes, key.c_str(), value);
       FP_RETURN_IF_ERROR(CheckIndexValue(place, Size("accessors"), "accessors"));
@@ -750,6 +867,14 @@ class Checker {
       }
       if ((vector3 || key.rfind("TEXCOORD_", 0) == 0) && accessor["componentType"] == 5125) {
         return place.Fail("accessor " + value.dump() + " holds 32-bit integers");
+      }
+      uint64_t count = 0;
+      if (key.rfind("COLOR_", 0) == 0) {
+        FP_RETURN_IF_ERROR(CheckKind(place, {"VEC3", "VEC4"}, {5126}, {5121, 5123}, count));
+      } else if (key.rfind("JOINTS_", 0) == 0) {
+        FP_RETURN_IF_ERROR(CheckKind(place, {"VEC4"}, {5121, 5123}, {}, count));
+      } else if (key.rfind("WEIGHTS_", 0) == 0) {
+        FP_RETURN_IF_ERROR(CheckKind(place, {"VEC4"}, {5126}, {5121, 5123}, count));
       }
       if (key == "POSITION") positions = accessor["count"].get<uint64_t>();
     }
@@ -832,13 +957,145 @@ class Checker {
     FP_RETURN_IF_ERROR(CheckNumbers(place, "translation", 3));
     FP_RETURN_IF_ERROR(CheckNumbers(place, "rotation", 4));
     FP_RETURN_IF_ERROR(CheckNumbers(place, "scale", 3));
+    if (const Json* weights = place.Find("weights"); weights != nullptr) {
+      FP_RETURN_IF_ERROR(CheckNumbers(place, "weights", weights->size(), -1e9, 1e9));
+    }
     return WithObject(place, "extensions", [&](const Place& extensions) {
+      FP_RETURN_IF_ERROR(
+          WithObject(extensions, "EXT_mesh_gpu_instancing", [&](const Place& instancing) {
+            return WithObject(instancing, "attributes",
+                              [&](const Place& attributes) { return CheckInstances(attributes); });
+          }));
       return WithObject(extensions, "KHR_lights_punctual", [&](const Place& p) -> absl::Status {
         std::optional<size_t> light;
         FP_RETURN_IF_ERROR(ReadIndex(p, "light", light_count_, "lights", light));
         return light ? absl::OkStatus() : p.Fail("has no 'light'");
       });
     });
+  }
+
+  absl::Status CheckInstances(const Place& attributes) {
+    std::optional<uint64_t> instances;
+    for (const auto& [key, value] : attributes.value().items()) {
+      const Place place(attributes, key.c_str(), value);
+      uint64_t count = 0;
+      if (key == "TRANSLATION" || key == "SCALE") {
+        FP_RETURN_IF_ERROR(CheckKind(place, {"VEC3"}, {5126}, {}, count));
+      } else if (key == "ROTATION") {
+        FP_RETURN_IF_ERROR(CheckKind(place, {"VEC4"}, {5126}, {5120, 5122}, count));
+      } else {
+        continue;
+      }
+      // Zeros that cost the file nothing would cost memory.
+      if (!json_["accessors"][value.get<size_t>()].contains("bufferView")) {
+        return place.Fail("accessor " + value.dump() + " has no bufferView");
+      }
+      if (instances && count != *instances) {
+        return place.Fail("has " + std::to_string(count) + " elements where others have " +
+                          std::to_string(*instances));
+      }
+      instances = count;
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status CheckSkin(const Place& place) {
+    FP_RETURN_IF_ERROR(CheckString(place, "name"));
+    const Json* joints = place.Find("joints");
+    if (joints == nullptr) return place.Fail("has no 'joints'");
+    FP_RETURN_IF_ERROR(CheckIndices(place, "joints", Size("nodes"), "nodes"));
+    if (joints->empty()) return place.Member("joints").Fail("is empty");
+    std::optional<size_t> skeleton;
+    FP_RETURN_IF_ERROR(ReadIndex(place, "skeleton", Size("nodes"), "nodes", skeleton));
+    const Json* matrices = place.Find("inverseBindMatrices");
+    if (matrices == nullptr) return absl::OkStatus();
+    const Place matrices_place(place, "inverseBindMatrices", *matrices);
+    uint64_t count = 0;
+    FP_RETURN_IF_ERROR(CheckKind(matrices_place, {"MAT4"}, {5126}, {}, count));
+    if (count < joints->size()) {
+      return matrices_place.Fail("has " + std::to_string(count) + " matrices for " +
+                                 std::to_string(joints->size()) + " joints");
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status CheckAnimation(const Place& place) {
+    struct Sampler {
+      uint64_t keys = 0;
+      bool is_cubic = false;
+    };
+    std::vector<Sampler> samplers;
+    FP_RETURN_IF_ERROR(CheckString(place, "name"));
+    FP_RETURN_IF_ERROR(ForEachObject(place, "samplers", [&](const Place& sampler) -> absl::Status {
+      Sampler s;
+      for (const char* key : {"input", "output"}) {
+        if (sampler.Find(key) == nullptr) return sampler.Fail("has no '" + std::string(key) + "'");
+        FP_RETURN_IF_ERROR(CheckIndexValue(sampler.Member(key), Size("accessors"), "accessors"));
+      }
+      FP_RETURN_IF_ERROR(CheckKind(sampler.Member("input"), {"SCALAR"}, {5126}, {}, s.keys));
+      FP_RETURN_IF_ERROR(CheckString(sampler, "interpolation"));
+      const std::string kind = sampler.value().value("interpolation", "LINEAR");
+      if (kind != "LINEAR" && kind != "STEP" && kind != "CUBICSPLINE") {
+        return sampler.Member("interpolation")
+            .Fail("is '" + kind + "' instead of LINEAR, STEP or CUBICSPLINE");
+      }
+      if (s.keys == 0) return sampler.Member("input").Fail("has no keyframes");
+      s.is_cubic = kind == "CUBICSPLINE";
+      samplers.push_back(s);
+      return absl::OkStatus();
+    }));
+    return ForEachObject(place, "channels", [&](const Place& channel) -> absl::Status {
+      std::optional<size_t> index;
+      FP_RETURN_IF_ERROR(ReadIndex(channel, "sampler", samplers.size(), "samplers", index));
+      if (!index) return channel.Fail("has no 'sampler'");
+      if (channel.Find("target") == nullptr) return channel.Fail("has no 'target'");
+      const Sampler& sampler = samplers[*index];
+      keyframes_ += sampler.keys;
+      if (keyframes_ > kMaxKeyframes) {
+        return channel.Fail("the animations have more than " + std::to_string(kMaxKeyframes) +
+                            " keyframes");
+      }
+      return WithObject(channel, "target", [&](const Place& target) -> absl::Status {
+        std::optional<size_t> node;
+        FP_RETURN_IF_ERROR(ReadIndex(target, "node", Size("nodes"), "nodes", node));
+        FP_RETURN_IF_ERROR(CheckString(target, "path"));
+        const Json* path = target.Find("path");
+        if (path == nullptr) return target.Fail("has no 'path'");
+        if (!node) return absl::OkStatus();  // moves nothing
+        return CheckOutput(place, target, path->get<std::string>(), *node, *index, sampler.keys,
+                           sampler.is_cubic);
+      });
+    });
+  }
+
+  // What a sampler gives must be what its target takes.
+  absl::Status CheckOutput(const Place& animation, const Place& target, const std::string& path,
+                           size_t node_index, size_t sampler, uint64_t keys, bool is_cubic) {
+    const Place samplers = animation.Member("samplers");
+    const Place sampler_place(samplers, sampler, samplers.value()[sampler]);
+    const Place output = sampler_place.Member("output");
+    uint64_t count = 0, per_key = is_cubic ? 3 : 1;
+    if (path == "translation" || path == "scale") {
+      FP_RETURN_IF_ERROR(CheckKind(output, {"VEC3"}, {5126}, {}, count));
+    } else if (path == "rotation") {
+      FP_RETURN_IF_ERROR(CheckKind(output, {"VEC4"}, {5126}, {5120, 5121, 5122, 5123}, count));
+    } else if (path == "weights") {
+      const Json& node = json_["nodes"][node_index];
+      const size_t targets = node.contains("mesh") ? morph_targets_[node["mesh"].get<size_t>()] : 0;
+      if (targets == 0) {
+        return target.Fail("weights of node " + std::to_string(node_index) +
+                           ", whose mesh has no morph targets");
+      }
+      FP_RETURN_IF_ERROR(CheckKind(output, {"SCALAR"}, {5126}, {5120, 5121, 5122, 5123}, count));
+      per_key *= targets;
+    } else {
+      return absl::OkStatus();  // of an extension
+    }
+    if (count / per_key != keys || count % per_key != 0) {
+      return output.Fail("has " + std::to_string(count) + " elements for " + std::to_string(keys) +
+                         " keyframes of " + std::to_string(per_key));
+    }
+    return absl::OkStatus();
   }
 
   absl::Status CheckSky(const Place& scene) {
@@ -860,6 +1117,8 @@ class Checker {
   std::vector<GltfBufferFile> buffer_files_;
   std::vector<View> views_;
   size_t light_count_ = 0;
+  std::vector<size_t> morph_targets_;  // by mesh
+  uint64_t keyframes_ = 0;
 };
 
 // The image behind root/textures[info.index], where all of that is well-formed.
@@ -884,6 +1143,12 @@ std::set<size_t> UsedImages(const Json& root) {
     const auto pbr = material.find("pbrMetallicRoughness");
     if (pbr != material.end() && pbr->is_object()) {
       AddImageOf(root, *pbr, "baseColorTexture", images);
+    }
+    const auto extensions = material.find("extensions");
+    if (extensions == material.end() || !extensions->is_object()) continue;
+    const auto glossiness = extensions->find("KHR_materials_pbrSpecularGlossiness");
+    if (glossiness != extensions->end() && glossiness->is_object()) {
+      AddImageOf(root, *glossiness, "diffuseTexture", images);
     }
   }
   return images;
@@ -927,13 +1192,22 @@ absl::StatusOr<GltfContainer> OpenGltfContainer(const std::string& name, const B
   };
   GltfContainer container;
   const bool magic = bytes.size() >= 4 && std::memcmp(bytes.data(), "glTF", 4) == 0;
+  const bool named_glb = name.size() > 4 && (name.compare(name.size() - 4, 4, ".glb") == 0 ||
+                                             name.compare(name.size() - 4, 4, ".GLB") == 0);
+  if (!magic && named_glb) {
+    return fail("byte 0: is no .glb of glTF 2.0: it has " + std::to_string(bytes.size()) +
+                " bytes and does not start with 'glTF'");
+  }
   if (!magic) {
     container.json = {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
     // A byte order mark is not part of the JSON.
     if (container.json.substr(0, 3) == "\xef\xbb\xbf") container.json.remove_prefix(3);
     return container;
   }
-  if (bytes.size() < 20) return fail("ends inside of the header of a .glb");
+  if (bytes.size() < 20) {
+    return fail("byte " + std::to_string(bytes.size()) + ": ends inside of the header of a .glb, " +
+                "which has 20 bytes");
+  }
   const uint32_t version = ReadLittle<uint32_t>(bytes, 4);
   if (version != 2) {
     return absl::InvalidArgumentError(name + ": byte 4: is a .glb of version " +

@@ -7,11 +7,17 @@
 #include <cstring>
 #include <limits>
 #include <map>
+#include <optional>
 #include <set>
+#include <tuple>
 #include <utility>
 
 #include "core/math/elementary.h"
+#include "core/scene/gltf_accessor.h"
+#include "core/scene/gltf_animation.h"
 #include "core/scene/gltf_check.h"
+#include "core/scene/gltf_deform.h"
+#include "core/scene/polygon.h"
 
 namespace farpoint {
 
@@ -20,11 +26,15 @@ namespace {
 // Luminous efficacy by which glTF's exporters turn watts into lumens (KHR_lights_punctual).
 constexpr double kLumensPerWatt = 683.0;
 
+constexpr const char* kSpecularGlossiness = "KHR_materials_pbrSpecularGlossiness";
+
 // Extensions that only concern what a Lambert surface does not show, or nothing that is rendered.
 const char* const kHarmlessExtensions[] = {"KHR_lights_punctual",
                                            "KHR_materials_emissive_strength",
                                            "KHR_texture_transform",
                                            "KHR_mesh_quantization",
+                                           "EXT_mesh_gpu_instancing",
+                                           "KHR_materials_pbrSpecularGlossiness",
                                            "KHR_materials_ior",
                                            "KHR_materials_specular",
                                            "KHR_materials_anisotropy",
@@ -91,113 +101,6 @@ bool KeepEncodedImage(tinygltf::Image* image, const int, std::string*, std::stri
   return true;
 }
 
-// --- Accessors ---
-
-double ReadComponent(const unsigned char* at, int type, bool normalized) {
-  const auto load = [at](auto value) {
-    std::memcpy(&value, at, sizeof(value));
-    return value;
-  };
-  // Normalised integers as in the glTF specification, section 3.11.
-  switch (type) {
-    case TINYGLTF_COMPONENT_TYPE_BYTE: {
-      const double v = load(int8_t{});
-      return normalized ? std::max(v / 127.0, -1.0) : v;
-    }
-    case TINYGLTF_COMPONENT_TYPE_UNSIGNED_BYTE: {
-      const double v = load(uint8_t{});
-      return normalized ? v / 255.0 : v;
-    }
-    case TINYGLTF_COMPONENT_TYPE_SHORT: {
-      const double v = load(int16_t{});
-      return normalized ? std::max(v / 32767.0, -1.0) : v;
-    }
-    case TINYGLTF_COMPONENT_TYPE_UNSIGNED_SHORT: {
-      const double v = load(uint16_t{});
-      return normalized ? v / 65535.0 : v;
-    }
-    case TINYGLTF_COMPONENT_TYPE_UNSIGNED_INT:
-      return load(uint32_t{});
-    default:
-      return static_cast<double>(load(float{}));
-  }
-}
-
-// Random access to the elements of an accessor whose ranges CheckGltf has checked.
-class AccessorReader {
- public:
-  AccessorReader(const tinygltf::Model& model, int index)
-      : accessor_(model.accessors[static_cast<size_t>(index)]),
-        component_size_(
-            tinygltf::GetComponentSizeInBytes(static_cast<uint32_t>(accessor_.componentType))),
-        components_(tinygltf::GetNumComponentsInType(static_cast<uint32_t>(accessor_.type))) {
-    const int element_size = component_size_ * components_;
-    if (accessor_.bufferView >= 0) {
-      const auto& view = model.bufferViews[static_cast<size_t>(accessor_.bufferView)];
-      base_ = Data(model, accessor_.bufferView, accessor_.byteOffset);
-      stride_ = view.byteStride == 0 ? static_cast<size_t>(element_size) : view.byteStride;
-    }
-    if (accessor_.sparse.isSparse) {
-      sparse_values_ = Data(model, accessor_.sparse.values.bufferView,
-                            static_cast<size_t>(accessor_.sparse.values.byteOffset));
-      const unsigned char* at = Data(model, accessor_.sparse.indices.bufferView,
-                                     static_cast<size_t>(accessor_.sparse.indices.byteOffset));
-      const int type = accessor_.sparse.indices.componentType;
-      const int size = tinygltf::GetComponentSizeInBytes(static_cast<uint32_t>(type));
-      sparse_indices_.resize(static_cast<size_t>(accessor_.sparse.count));
-      for (auto& value : sparse_indices_) {
-        value = static_cast<uint32_t>(ReadComponent(at, type, false));
-        at += size;
-      }
-    }
-  }
-
-  size_t count() const { return accessor_.count; }
-
-  // Indices of sparse values must ascend and lie inside.
-  bool SparseIndicesAreValid() const {
-    for (size_t i = 0; i < sparse_indices_.size(); ++i) {
-      if (sparse_indices_[i] >= accessor_.count) return false;
-      if (i > 0 && sparse_indices_[i] <= sparse_indices_[i - 1]) return false;
-    }
-    return true;
-  }
-
-  double Get(size_t element, int component) const {
-    const unsigned char* at = base_ == nullptr ? nullptr : base_ + element * stride_;
-    if (!sparse_indices_.empty()) {
-      const auto it = std::lower_bound(sparse_indices_.begin(), sparse_indices_.end(), element);
-      if (it != sparse_indices_.end() && *it == element) {
-        at = sparse_values_ + static_cast<size_t>(it - sparse_indices_.begin()) *
-                                  static_cast<size_t>(component_size_ * components_);
-      }
-    }
-    if (at == nullptr) return 0;
-    return ReadComponent(at + component * component_size_, accessor_.componentType,
-                         accessor_.normalized);
-  }
-  Vec3f Get3(size_t element) const {
-    return {static_cast<float>(Get(element, 0)), static_cast<float>(Get(element, 1)),
-            static_cast<float>(Get(element, 2))};
-  }
-  Vec2f Get2(size_t element) const {
-    return {static_cast<float>(Get(element, 0)), static_cast<float>(Get(element, 1))};
-  }
-
- private:
-  static const unsigned char* Data(const tinygltf::Model& model, int view_index, size_t offset) {
-    const auto& view = model.bufferViews[static_cast<size_t>(view_index)];
-    return model.buffers[static_cast<size_t>(view.buffer)].data.data() + view.byteOffset + offset;
-  }
-
-  const tinygltf::Accessor& accessor_;
-  int component_size_, components_;
-  const unsigned char* base_ = nullptr;
-  size_t stride_ = 0;
-  const unsigned char* sparse_values_ = nullptr;
-  std::vector<uint32_t> sparse_indices_;
-};
-
 // --- Small conversions ---
 
 Vec3d ToVec3d(const std::vector<double>& v) { return {v[0], v[1], v[2]}; }
@@ -212,15 +115,7 @@ Affine LocalTransform(const tinygltf::Node& node) {
     return m;
   }
   if (node.rotation.size() == 4) {
-    // Normalised, so that a rounded quaternion scales nothing.
-    double x = node.rotation[0], y = node.rotation[1], z = node.rotation[2], w = node.rotation[3];
-    const double length = std::sqrt(x * x + y * y + z * z + w * w);
-    if (length > 0 && std::isfinite(length)) {
-      x /= length, y /= length, z /= length, w /= length;
-      m.column[0] = {1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)};
-      m.column[1] = {2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)};
-      m.column[2] = {2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)};
-    }
+    m = RotationOf({node.rotation[0], node.rotation[1], node.rotation[2], node.rotation[3]});
   }
   if (node.scale.size() == 3) {
     for (int c = 0; c < 3; ++c) m.column[c] *= node.scale[static_cast<size_t>(c)];
@@ -251,6 +146,33 @@ double NumberOr(const tinygltf::Value& object, const char* key, double fallback)
   return value.IsNumber() ? value.GetNumberAsDouble() : fallback;
 }
 
+// A texture info within an extension, which tinygltf leaves as it is.
+struct TextureInfo {
+  int index = -1;
+  int uv_set = 0;
+  const tinygltf::Value* transform = nullptr;  // KHR_texture_transform
+};
+
+TextureInfo InfoOf(const tinygltf::TextureInfo& info) {
+  return {info.index, info.texCoord, FindExtension(info.extensions, "KHR_texture_transform")};
+}
+
+TextureInfo InfoOf(const tinygltf::Value& holder, const char* key) {
+  TextureInfo info;
+  if (!holder.Has(key) || !holder.Get(key).IsObject()) return info;
+  const tinygltf::Value& object = holder.Get(key);
+  info.index = static_cast<int>(NumberOr(object, "index", -1));
+  info.uv_set = static_cast<int>(NumberOr(object, "texCoord", 0));
+  if (object.Has("extensions") && object.Get("extensions").IsObject()) {
+    const tinygltf::Value& extensions = object.Get("extensions");
+    if (extensions.Has("KHR_texture_transform")) {
+      const tinygltf::Value& transform = extensions.Get("KHR_texture_transform");
+      if (transform.IsObject()) info.transform = &transform;
+    }
+  }
+  return info;
+}
+
 std::string Counted(size_t count, const char* what) {
   return std::to_string(count) + " " + what + (count == 1 ? "" : "s");
 }
@@ -262,6 +184,15 @@ class Importer {
 
   absl::StatusOr<ImportedScene> Run() {
     FP_RETURN_IF_ERROR(Load());
+    FP_ASSIGN_OR_RETURN(imported_.animation, AnimationRangeOf(model_, asset_.root));
+    if (options_.time_s) {
+      if (!std::isfinite(*options_.time_s)) {
+        return absl::InvalidArgumentError(asset_.root +
+                                          ": /animations: the time asked for is not finite; give "
+                                          "it in seconds");
+      }
+      FP_RETURN_IF_ERROR(ApplyAnimations(*options_.time_s, asset_.root, model_));
+    }
     scene_.name = asset_.root;
     NoteExtensions();
     FP_RETURN_IF_ERROR(ImportTextures());
@@ -273,6 +204,16 @@ class Importer {
     NoteCounts();
     imported_.scene = std::move(scene_);
     return std::move(imported_);
+  }
+
+  absl::StatusOr<std::optional<TimeRange>> FindAnimation() {
+    FP_ASSIGN_OR_RETURN(const Blob file, asset_.Find(asset_.root));
+    FP_ASSIGN_OR_RETURN(const GltfContainer container, OpenGltfContainer(asset_.root, file));
+    if (container.json.find("\"animations\"") == std::string_view::npos) {
+      return std::optional<TimeRange>();
+    }
+    FP_RETURN_IF_ERROR(Load());
+    return AnimationRangeOf(model_, asset_.root);
   }
 
  private:
@@ -335,6 +276,16 @@ class Importer {
 
   void NoteExtensions() {
     for (const std::string& name : model_.extensionsUsed) {
+      if (name == "KHR_materials_unlit") {
+        Note(
+            "the extension 'KHR_materials_unlit' is ignored: its materials are lit, in their base "
+            "colour");
+        continue;
+      }
+      if (name == "KHR_materials_variants") {
+        Note("the extension 'KHR_materials_variants' is ignored: the default materials are shown");
+        continue;
+      }
       bool harmless = false;
       for (const char* known : kHarmlessExtensions) harmless |= name == known;
       if (!harmless) Note("the extension '" + name + "' is ignored, which may change the look");
@@ -347,6 +298,9 @@ class Importer {
     for (const auto& material : model_.materials) {
       used.insert(material.pbrMetallicRoughness.baseColorTexture.index);
       used.insert(material.emissiveTexture.index);
+      if (const auto* e = FindExtension(material.extensions, kSpecularGlossiness)) {
+        used.insert(InfoOf(*e, "diffuseTexture").index);
+      }
     }
     std::vector<Blob> images(model_.images.size());
     for (size_t t = 0; t < model_.textures.size(); ++t) {
@@ -386,12 +340,12 @@ class Importer {
     return absl::OkStatus();
   }
 
-  TextureRef ImportTextureRef(const tinygltf::TextureInfo& info, const std::string& place) {
+  TextureRef ImportTextureRef(const TextureInfo& info, const std::string& place) {
     TextureRef ref;
     if (info.index < 0 || model_.textures[static_cast<size_t>(info.index)].source < 0) return ref;
     ref.texture = info.index;
-    double uv_set = info.texCoord;
-    if (const auto* transform = FindExtension(info.extensions, "KHR_texture_transform")) {
+    double uv_set = info.uv_set;
+    if (const auto* transform = info.transform) {
       uv_set = NumberOr(*transform, "texCoord", uv_set);
       const auto pair = [&](const char* key, Vec2f fallback) -> Vec2f {
         if (!transform->Has(key)) return fallback;
@@ -420,18 +374,31 @@ class Importer {
       const std::string place = Indexed("materials", m);
       Material material;
       material.name = NameOr(source.name, "material", m);
-      if (pbr.baseColorFactor.size() == 4) {
+      std::vector<double> factor = pbr.baseColorFactor;
+      TextureInfo texture = InfoOf(pbr.baseColorTexture);
+      std::string texture_place = place + "/pbrMetallicRoughness/baseColorTexture";
+      // Its diffuse colour is what a Lambert surface shows; the metallic variant is a stand-in.
+      if (const auto* e = FindExtension(source.extensions, kSpecularGlossiness)) {
+        factor = {1, 1, 1, 1};
+        if (e->Has("diffuseFactor")) {
+          for (size_t c = 0; c < 4; ++c) {
+            factor[c] = e->Get("diffuseFactor").Get(c).GetNumberAsDouble();
+          }
+        }
+        texture = InfoOf(*e, "diffuseTexture");
+        texture_place = place + "/extensions/" + kSpecularGlossiness + "/diffuseTexture";
+      }
+      if (factor.size() == 4) {
         bool above_one = false;
         for (int c = 0; c < 3; ++c) {
-          const double factor = pbr.baseColorFactor[static_cast<size_t>(c)];
-          above_one |= factor > 1;
-          material.base_color[c] = static_cast<float>(std::min(factor, 1.0));
+          const double value = factor[static_cast<size_t>(c)];
+          above_one |= value > 1;
+          material.base_color[c] = static_cast<float>(std::min(value, 1.0));
         }
-        if (above_one) Note(place + ": baseColorFactor above 1 would create light; taken as 1");
-        material.base_alpha = static_cast<float>(std::min(pbr.baseColorFactor[3], 1.0));
+        if (above_one) Note(place + ": a base colour above 1 would create light; taken as 1");
+        material.base_alpha = static_cast<float>(std::min(factor[3], 1.0));
       }
-      material.base_color_texture =
-          ImportTextureRef(pbr.baseColorTexture, place + "/pbrMetallicRoughness/baseColorTexture");
+      material.base_color_texture = ImportTextureRef(texture, texture_place);
       material.metallic = static_cast<float>(pbr.metallicFactor);
       material.roughness = static_cast<float>(pbr.roughnessFactor);
       if (source.alphaMode == "MASK") {
@@ -453,7 +420,7 @@ class Importer {
         }
       }
       material.emission_texture =
-          ImportTextureRef(source.emissiveTexture, place + "/emissiveTexture");
+          ImportTextureRef(InfoOf(source.emissiveTexture), place + "/emissiveTexture");
       scene_.materials.push_back(std::move(material));
     }
     if (blended > 0) {
@@ -468,14 +435,15 @@ class Importer {
       const auto& mesh = model_.meshes[m];
       for (size_t p = 0; p < mesh.primitives.size(); ++p) {
         const std::string place = Indexed("meshes", m) + Indexed("primitives", p);
-        FP_RETURN_IF_ERROR(ImportPrimitive(mesh, m, mesh.primitives[p], place));
+        FP_RETURN_IF_ERROR(ImportPrimitive(mesh, m, p, place));
       }
     }
     return absl::OkStatus();
   }
 
   absl::Status ImportPrimitive(const tinygltf::Mesh& source_mesh, size_t mesh_index,
-                               const tinygltf::Primitive& primitive, const std::string& place) {
+                               size_t primitive_index, const std::string& place) {
+    const tinygltf::Primitive& primitive = source_mesh.primitives[primitive_index];
     if (primitive.mode < TINYGLTF_MODE_TRIANGLES) {
       ++skipped_lines_;
       return absl::OkStatus();
@@ -485,7 +453,6 @@ class Importer {
       ++skipped_empty_;
       return absl::OkStatus();
     }
-    if (!primitive.targets.empty()) ++morphed_;
     const AccessorReader positions(model_, position->second);
     if (!positions.SparseIndicesAreValid()) {
       return Fail(place + "/attributes/POSITION",
@@ -503,7 +470,7 @@ class Importer {
       return absl::OkStatus();
     }
     // Many exporters let the primitives of a mesh share one big vertex buffer.
-    const std::vector<uint32_t> used = CompactVertices(mesh, positions.count());
+    std::vector<uint32_t> used = CompactVertices(mesh, positions.count());
     mesh.positions.reserve(used.size());
     for (const uint32_t v : used) {
       const Vec3f p = positions.Get3(v);
@@ -529,8 +496,58 @@ class Importer {
       }));
     }
     if (mesh.material >= 0) NoteMissingUvs(mesh, place);
+    FP_RETURN_IF_ERROR(ApplyVertexColors(primitive, used, place, mesh));
     meshes_[mesh_index].push_back(static_cast<uint32_t>(scene_.meshes.size()));
     scene_.meshes.push_back(std::move(mesh));
+    const bool deforms = !primitive.targets.empty() || primitive.attributes.count("JOINTS_0") != 0;
+    sources_.push_back({mesh_index, primitive_index, {}});
+    if (deforms) sources_.back().vertices = std::move(used);
+    return absl::OkStatus();
+  }
+
+  // COLOR_0 multiplies the base colour (glTF specification, section 3.9.2). One colour for all
+  // vertices is exact; more are shown in their mean.
+  absl::Status ApplyVertexColors(const tinygltf::Primitive& primitive,
+                                 const std::vector<uint32_t>& used, const std::string& place,
+                                 Mesh& mesh) {
+    std::vector<Rgb> colors, alphas;
+    FP_RETURN_IF_ERROR(
+        ReadAttribute(primitive, "COLOR_0", place, [&](const AccessorReader& reader) {
+          const int type =
+              model_.accessors[static_cast<size_t>(primitive.attributes.at("COLOR_0"))].type;
+          for (const uint32_t v : used) {
+            Rgb color = reader.Get3(v);
+            for (int c = 0; c < 3; ++c) {
+              color[c] = color[c] >= 0 ? std::min(color[c], 1.0f) : 0.0f;  // NaN: 0
+            }
+            const double alpha = type == TINYGLTF_TYPE_VEC4 ? reader.Get(v, 3) : 1;
+            colors.push_back(color);
+            alphas.push_back(Rgb(alpha >= 0 ? static_cast<float>(std::min(alpha, 1.0)) : 0.0f));
+          }
+        }));
+    if (colors.empty()) return absl::OkStatus();
+    const auto all_equal = [](const std::vector<Rgb>& values) {
+      return std::all_of(values.begin(), values.end(),
+                         [&](const Rgb& value) { return value == values[0]; });
+    };
+    Rgb color = colors[0], alpha = alphas[0];
+    if (!all_equal(colors) || !all_equal(alphas)) {
+      color = MeanColor(mesh, colors);
+      alpha = MeanColor(mesh, alphas);
+      ++mean_colors_;
+    }
+    if (color == Rgb(1) && alpha.x == 1) return absl::OkStatus();
+    const auto [it, is_new] =
+        colored_materials_.try_emplace({mesh.material, color.x, color.y, color.z, alpha.x},
+                                       static_cast<int32_t>(scene_.materials.size()));
+    if (is_new) {
+      Material material =
+          mesh.material >= 0 ? scene_.materials[static_cast<size_t>(mesh.material)] : Material();
+      material.base_color *= color;
+      material.base_alpha *= alpha.x;
+      scene_.materials.push_back(std::move(material));
+    }
+    mesh.material = it->second;
     return absl::OkStatus();
   }
 
@@ -688,58 +705,194 @@ class Importer {
     std::vector<Visit> stack;
     const std::vector<int> roots = RootNodes();
     for (auto it = roots.rbegin(); it != roots.rend(); ++it) stack.push_back({*it, -1, {}});
-    std::vector<bool> visited(model_.nodes.size(), false);
+    std::vector<size_t> order;
+    world_from_node_.resize(model_.nodes.size());
     while (!stack.empty()) {
       const Visit visit = stack.back();
       stack.pop_back();
       const auto n = static_cast<size_t>(visit.node);
       const std::string place = Indexed("nodes", n);
-      if (visited[n]) {
+      if (world_from_node_[n]) {
         return Fail(place, "is reached twice" +
                                (visit.parent < 0 ? std::string(" as a root of the scene")
                                                  : ", the second time from node " +
                                                        std::to_string(visit.parent)) +
                                "; nodes must form a tree: correct the file or export it again");
       }
-      visited[n] = true;
       const auto& node = model_.nodes[n];
       const Affine world_from_node = visit.world_from_parent * LocalTransform(node);
       if (!IsFinite(world_from_node)) {
         return Fail(place, "its transform is beyond the range of numbers; scale the scene down");
       }
-      FP_RETURN_IF_ERROR(ImportNode(node, n, world_from_node));
+      world_from_node_[n] = world_from_node;
+      order.push_back(n);
       for (auto it = node.children.rbegin(); it != node.children.rend(); ++it) {
         stack.push_back({*it, visit.node, world_from_node});
       }
     }
-    const size_t unreached = static_cast<size_t>(std::count(visited.begin(), visited.end(), false));
+    const size_t unreached = model_.nodes.size() - order.size();
     // A cycle without a root is not reached at all.
     if (model_.scenes.empty() && unreached > 0) {
       return Fail("/nodes",
                   Counted(unreached, "node") +
                       " form cycles; nodes must form a tree: correct the file or export it again");
     }
+    // Skins need the places of all joints first.
+    for (const size_t n : order) FP_RETURN_IF_ERROR(ImportNode(n));
     return absl::OkStatus();
   }
 
-  absl::Status ImportNode(const tinygltf::Node& node, size_t n, const Affine& world_from_node) {
+  absl::Status ImportNode(size_t n) {
+    const tinygltf::Node& node = model_.nodes[n];
+    const Affine& world_from_node = *world_from_node_[n];
     const std::string name = NameOr(node.name, "node", n);
-    if (node.mesh >= 0) {
-      if (node.skin >= 0) ++skinned_;
-      for (const uint32_t mesh : meshes_[static_cast<size_t>(node.mesh)]) {
-        scene_.instances.push_back({name, mesh, world_from_node});
-        instanced_triangles_ += scene_.meshes[mesh].triangles.size();
-        if (instanced_triangles_ > options_.max_triangles) {
-          return TooManyTriangles(Indexed("nodes", n));
-        }
-      }
-    }
+    if (node.mesh >= 0) FP_RETURN_IF_ERROR(ImportMeshNode(node, n, name, world_from_node));
     if (node.camera >= 0) ImportCamera(node.camera, name, world_from_node);
     if (const auto* e = FindExtension(node.extensions, "KHR_lights_punctual")) {
       const auto light = static_cast<size_t>(NumberOr(*e, "light", 0));
       return ImportLight(light, Indexed("nodes", n), name, world_from_node);
     }
     return absl::OkStatus();
+  }
+
+  absl::Status ImportMeshNode(const tinygltf::Node& node, size_t n, const std::string& name,
+                              const Affine& world_from_node) {
+    const std::string place = Indexed("nodes", n);
+    std::vector<Affine> copies = {Affine()};  // node from instance
+    if (const auto* e = FindExtension(node.extensions, "EXT_mesh_gpu_instancing")) {
+      FP_ASSIGN_OR_RETURN(copies, ReadInstances(*e, place));
+    }
+    const auto& weights = !node.weights.empty()
+                              ? node.weights
+                              : model_.meshes[static_cast<size_t>(node.mesh)].weights;
+    const bool morphed =
+        std::any_of(weights.begin(), weights.end(), [](double weight) { return weight != 0; });
+    for (const uint32_t base : meshes_[static_cast<size_t>(node.mesh)]) {
+      uint32_t mesh = base;
+      Affine world_from_mesh = world_from_node;
+      const auto& source = sources_[base];
+      const auto& primitive = model_.meshes[source.mesh].primitives[source.primitive];
+      Deformation deformation;
+      if (morphed && !primitive.targets.empty()) deformation.weights = weights;
+      if (node.skin >= 0 && primitive.attributes.count("JOINTS_0") != 0 &&
+          primitive.attributes.count("WEIGHTS_0") != 0) {
+        FP_ASSIGN_OR_RETURN(deformation.world_from_bind, WorldFromBind(node.skin));
+      }
+      const bool is_skinned = !deformation.world_from_bind.empty();
+      FP_RETURN_IF_ERROR(CountTriangles(base, is_skinned ? 1 : copies.size(), place));
+      if (is_skinned || !deformation.weights.empty()) {
+        FP_ASSIGN_OR_RETURN(
+            DeformedMesh deformed,
+            DeformMesh(model_, primitive, scene_.meshes[base], source.vertices, deformation,
+                       asset_.root + ": " + Indexed("meshes", source.mesh) +
+                           Indexed("primitives", source.primitive)));
+        mesh = static_cast<uint32_t>(scene_.meshes.size());
+        scene_.meshes.push_back(std::move(deformed.mesh));
+        if (deformed.in_world) {
+          world_from_mesh = Affine();
+          world_from_mesh.translation = deformed.world_offset;
+        }
+      }
+      if (is_skinned) {  // a skin takes the place of its node
+        scene_.instances.push_back({name, mesh, world_from_mesh});
+        continue;
+      }
+      for (const Affine& copy : copies) {
+        scene_.instances.push_back({name, mesh, world_from_mesh * copy});
+      }
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status CountTriangles(uint32_t mesh, size_t copies, const std::string& place) {
+    // Each factor is below 2^36.
+    instanced_triangles_ += scene_.meshes[mesh].triangles.size() * uint64_t{copies};
+    return instanced_triangles_ > options_.max_triangles ? TooManyTriangles(place)
+                                                         : absl::OkStatus();
+  }
+
+  // EXT_mesh_gpu_instancing: translation, rotation and scale of each copy, in the node's frame.
+  absl::StatusOr<std::vector<Affine>> ReadInstances(const tinygltf::Value& extension,
+                                                    const std::string& node_place) {
+    const std::string place = node_place + "/extensions/EXT_mesh_gpu_instancing/attributes";
+    if (!extension.Has("attributes")) return std::vector<Affine>{Affine()};
+    const tinygltf::Value& attributes = extension.Get("attributes");
+    std::optional<AccessorReader> readers[3];
+    const char* const names[3] = {"TRANSLATION", "ROTATION", "SCALE"};
+    std::optional<size_t> count;
+    for (int i = 0; i < 3; ++i) {
+      if (!attributes.Has(names[i])) continue;
+      readers[i].emplace(model_, static_cast<int>(NumberOr(attributes, names[i], 0)));
+      if (!readers[i]->SparseIndicesAreValid()) {
+        return Fail(place + "/" + names[i],
+                    "the indices of its sparse accessor do not ascend inside of the accessor; "
+                    "correct the file or export it again");
+      }
+      count = readers[i]->count();
+    }
+    if (!count) return std::vector<Affine>{Affine()};
+    // Before anything of that size is allocated.
+    if (*count > options_.max_triangles) return TooManyTriangles(place);
+    std::vector<Affine> copies(*count);
+    for (size_t k = 0; k < copies.size(); ++k) {
+      if (readers[1]) {
+        copies[k] = RotationOf({readers[1]->Get(k, 0), readers[1]->Get(k, 1), readers[1]->Get(k, 2),
+                                readers[1]->Get(k, 3)});
+      }
+      if (readers[2]) {
+        const Vec3d scale = readers[2]->Get3d(k);
+        for (int c = 0; c < 3; ++c) copies[k].column[c] *= scale[c];
+      }
+      if (readers[0]) copies[k].translation = readers[0]->Get3d(k);
+      if (!IsFinite(copies[k])) {
+        return Fail(place, "instance " + std::to_string(k) +
+                               " is not finite; correct the file or export it again");
+      }
+    }
+    return copies;
+  }
+
+  // Of each joint: where a point of the mesh as it was bound goes to in the world.
+  absl::StatusOr<std::vector<Affine>> WorldFromBind(int skin_index) {
+    if (const auto it = world_from_bind_.find(skin_index); it != world_from_bind_.end()) {
+      return it->second;
+    }
+    const auto& skin = model_.skins[static_cast<size_t>(skin_index)];
+    const std::string place = Indexed("skins", static_cast<size_t>(skin_index));
+    std::optional<AccessorReader> matrices;
+    if (skin.inverseBindMatrices >= 0) {
+      matrices.emplace(model_, skin.inverseBindMatrices);
+      if (!matrices->SparseIndicesAreValid()) {
+        return Fail(place + "/inverseBindMatrices",
+                    "the indices of its sparse accessor do not ascend inside of the accessor; "
+                    "correct the file or export it again");
+      }
+    }
+    std::vector<Affine> world_from_bind(skin.joints.size());
+    for (size_t j = 0; j < skin.joints.size(); ++j) {
+      const auto& world_from_joint = world_from_node_[static_cast<size_t>(skin.joints[j])];
+      if (!world_from_joint) {
+        return Fail(place + "/joints/" + std::to_string(j),
+                    "node " + std::to_string(skin.joints[j]) +
+                        " is not part of the scene that is shown; add it to the scene");
+      }
+      Affine joint_from_bind;
+      if (matrices) {
+        for (int c = 0; c < 3; ++c) {
+          joint_from_bind.column[c] = {matrices->Get(j, 4 * c), matrices->Get(j, 4 * c + 1),
+                                       matrices->Get(j, 4 * c + 2)};
+        }
+        joint_from_bind.translation = {matrices->Get(j, 12), matrices->Get(j, 13),
+                                       matrices->Get(j, 14)};
+      }
+      world_from_bind[j] = *world_from_joint * joint_from_bind;
+      if (!IsFinite(world_from_bind[j])) {
+        return Fail(place + "/joints/" + std::to_string(j),
+                    "its matrix is not finite; correct the file or export it again");
+      }
+    }
+    world_from_bind_.emplace(skin_index, world_from_bind);
+    return world_from_bind;
   }
 
   void ImportCamera(int index, const std::string& node_name, const Affine& world_from_node) {
@@ -834,12 +987,13 @@ class Importer {
     }
     if (skipped_empty_ > 0)
       Note(Counted(skipped_empty_, "primitive") + " without triangles skipped");
-    if (morphed_ > 0) {
-      Note(Counted(morphed_, "primitive") + " with morph targets: shown without them");
+    if (mean_colors_ > 0) {
+      Note(Counted(mean_colors_, "primitive") +
+           " with colours at the vertices (COLOR_0): shown in their mean");
     }
-    if (skinned_ > 0) Note(Counted(skinned_, "skinned node") + ": shown without the skin");
-    if (!model_.animations.empty()) {
-      Note(Counted(model_.animations.size(), "animation") + " ignored: the rest pose is shown");
+    if (imported_.animation && !options_.time_s) {
+      Note(Counted(model_.animations.size(), "animation") +
+           " in the file: the rest pose is shown; choose frames to see them move");
     }
     if (bad_uvs_ > 0) {
       Note(Counted(bad_uvs_, "texture coordinate") + " not finite: taken as (0, 0)");
@@ -852,14 +1006,27 @@ class Importer {
   Scene scene_;
   ImportedScene imported_;
   std::vector<std::vector<uint32_t>> meshes_;  // by glTF mesh: indices into scene_.meshes
+  struct MeshSource {
+    size_t mesh, primitive;
+    std::vector<uint32_t> vertices;  // the primitive's, if it may be deformed
+  };
+  std::vector<MeshSource> sources_;                     // as the first of scene_.meshes
+  std::vector<std::optional<Affine>> world_from_node_;  // of the nodes that are shown
+  std::map<int, std::vector<Affine>> world_from_bind_;  // by skin
+  std::map<std::tuple<int32_t, float, float, float, float>, int32_t> colored_materials_;
   uint64_t mesh_triangles_ = 0, instanced_triangles_ = 0;
-  size_t skipped_lines_ = 0, skipped_empty_ = 0, morphed_ = 0, skinned_ = 0, bad_uvs_ = 0;
+  size_t skipped_lines_ = 0, skipped_empty_ = 0, bad_uvs_ = 0, mean_colors_ = 0;
 };
 
 }  // namespace
 
 absl::StatusOr<ImportedScene> ImportGltf(const AssetBundle& asset, const ImportOptions& options) {
   return Importer(asset, options).Run();
+}
+
+absl::StatusOr<std::optional<TimeRange>> FindGltfAnimation(const AssetBundle& asset) {
+  const ImportOptions options;
+  return Importer(asset, options).FindAnimation();
 }
 
 }  // namespace farpoint

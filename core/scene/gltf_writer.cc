@@ -308,7 +308,11 @@ void AppendChunk(std::vector<std::byte>& file, uint32_t type, std::span<const st
 }  // namespace
 
 absl::Status WriteGltf(const Scene& scene, const std::string& path) {
-  FP_RETURN_IF_ERROR(SceneFormatOf(path).status());
+  FP_ASSIGN_OR_RETURN(const SceneFormat format, SceneFormatOf(path));
+  if (format != SceneFormat::kGltf) {
+    return absl::InvalidArgumentError("'" + path + "' is no name of a glTF file; end it in .gltf " +
+                                      "or .glb");
+  }
   for (size_t m = 0; m < scene.meshes.size(); ++m) {
     if (!scene.meshes[m].triangles.empty()) continue;
     return absl::InvalidArgumentError("mesh " + std::to_string(m) + " ('" + scene.meshes[m].name +

@@ -71,6 +71,12 @@ absl::StatusOr<ImportedScene> ImportScene(const AssetBundle& asset, const Import
   return absl::InternalError("unknown scene format");
 }
 
+absl::StatusOr<std::optional<TimeRange>> FindAnimation(const AssetBundle& asset) {
+  FP_ASSIGN_OR_RETURN(const SceneFormat format, SceneFormatOf(asset.root));
+  if (format != SceneFormat::kGltf) return std::optional<TimeRange>();
+  return FindGltfAnimation(asset);
+}
+
 void EnsureCameraAndLight(ImportedScene& imported) {
   Scene& scene = imported.scene;
   if (scene.cameras.empty()) {

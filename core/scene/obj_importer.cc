@@ -657,7 +657,7 @@ absl::StatusOr<ImportedScene> ImportObj(const AssetBundle& asset, const ImportOp
   return ObjReader(asset, options).Run();
 }
 
-absl::Status VisitObjReferences(const std::string& root, const Blob& file, AssetSource& source) {
+absl::Status VisitObjReferences(const std::string& name, const Blob& file, AssetSource& source) {
   Libraries libraries;
   std::set<std::string> used;
   LineReader lines(TextOf(file));
@@ -668,7 +668,7 @@ absl::Status VisitObjReferences(const std::string& root, const Blob& file, Asset
     if (key == "mtllib") libraries.emplace_back(std::string(Trim(rest)), lines.number());
     if (key == "usemtl") used.emplace(Trim(rest));
   }
-  return ObjMaterials::Load(root, libraries, used, source).status();
+  return ObjMaterials::Load(name, libraries, used, source).status();
 }
 
 }  // namespace farpoint

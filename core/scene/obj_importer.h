@@ -13,8 +13,9 @@ namespace farpoint {
 
 absl::StatusOr<ImportedScene> ImportObj(const AssetBundle& asset, const ImportOptions& options);
 
-// Reads from `source` what the OBJ file `root` needs: its material libraries, and the textures of
-// the materials that it uses. Errors are those of ObjMaterials::Load.
-absl::Status VisitObjReferences(const std::string& root, const Blob& file, AssetSource& source);
+// Reads from `source` what the OBJ file needs, which `name` names in messages: its material
+// libraries, and the textures of the materials that it uses. Errors are those of
+// ObjMaterials::Load.
+absl::Status VisitObjReferences(const std::string& name, const Blob& file, AssetSource& source);
 
 }  // namespace farpoint
