@@ -32,6 +32,14 @@ float RangeWindow(const PreparedLight& light, float d_m) {
 // angles, would lose its digits, and over so little the two densities are the same.
 constexpr double kSmallSolidAngle = 1e-3;
 
+// [0, 1) -> [0, 1] by the density that goes from f0 to f1 (> 0), by which `pdf` is multiplied.
+double SampleLinear(double u, double f0, double f1, double& pdf) {
+  const double x =
+      std::min(u * (f0 + f1) / (f0 + std::sqrt(f0 * f0 + u * (f1 * f1 - f0 * f0))), 1.0);
+  pdf *= 2.0 * (f0 + (f1 - f0) * x) / (f0 + f1);
+  return x;
+}
+
 // The least power of a light beside one of power 1 that keeps it a normal number.
 constexpr float kLeastPower = 0x1p-100f;
 
@@ -46,8 +54,8 @@ float InversePowerOfTwo(float x) {
 // By solid angle (Arvo 1995, "Stratified Sampling of Spherical Triangles"): bounded however near
 // the emitter comes, where sampling by area has the unbounded factor cosθ_l / d².
 std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitter& e,
-                                                                    const Vec3f& p, float u,
-                                                                    float v) const {
+                                                                    const Vec3f& p, const Vec3f& n,
+                                                                    float u, float v) const {
   const Vec3d origin(p);
   const Vec3d corner[3] = {Vec3d(e.v0) - origin, Vec3d(e.v0 + e.e1) - origin,
                            Vec3d(e.v0 + e.e2) - origin};
@@ -75,6 +83,18 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
         static_cast<float>(std::fabs(Dot(q, Vec3d(e.normal))) / (d * d2) * e.area_m2);
     return out;
   }
+  // (u, v) = (., 0), (0, 1), (1, 1) become b, a, c below: the corners' cosines make a bilinear
+  // density over the square that is near to the cosine (Hart et al. 2020, "Practical Product
+  // Sampling by Fitting and Composing Warps").
+  const Vec3d normal(n);
+  constexpr double kLeastCosine = 0.01;
+  const double cos_a = std::max(Dot(normal, a), kLeastCosine);
+  const double cos_b = std::max(Dot(normal, b), kLeastCosine);
+  const double cos_corner_c = std::max(Dot(normal, c), kLeastCosine);
+  double warp_pdf = 1.0;
+  const double warped_v = SampleLinear(v, 2.0 * cos_b, cos_a + cos_corner_c, warp_pdf);
+  const double warped_u = SampleLinear(u, cos_b + (cos_a - cos_b) * warped_v,
+                                       cos_b + (cos_corner_c - cos_b) * warped_v, warp_pdf);
   // Interior angles at the corners, from the planes of the great circles.
   const Vec3d n_ab = Cross(a, b), n_ca = Cross(c, a);
   const auto angle = [](const Vec3d& m, const Vec3d& n) {
@@ -84,7 +104,7 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
   const double cos_alpha = DetSinCos(alpha).cos, sin_alpha = DetSinCos(alpha).sin;
   const double cos_c = Dot(a, b);  // arc opposite to corner c
   // The sub-triangle of area u Ω: its third corner lies on the arc from a to c.
-  const SinCos phi = DetSinCos(u * solid_angle - alpha);
+  const SinCos phi = DetSinCos(warped_u * solid_angle - alpha);
   const double uu = phi.cos - cos_alpha;
   const double vv = phi.sin + sin_alpha * cos_c;
   const double denominator = (vv * phi.sin + uu * phi.cos) * sin_alpha;
@@ -94,7 +114,7 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
           : 1.0;
   const Vec3d toward_c = NormalizeOr(c - a * Dot(c, a), a);
   const Vec3d c_hat = a * q + toward_c * std::sqrt(std::max(0.0, 1.0 - q * q));
-  const double z = 1.0 - static_cast<double>(v) * (1.0 - Dot(c_hat, b));
+  const double z = 1.0 - warped_v * (1.0 - Dot(c_hat, b));
   const Vec3d w = Normalize(b * z + NormalizeOr(c_hat - b * Dot(c_hat, b), c_hat) *
                                         std::sqrt(std::max(0.0, 1.0 - z * z)));
   // Where the direction meets the triangle's plane.
@@ -110,7 +130,7 @@ std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitte
   out.b2 = static_cast<float>(std::clamp((Dot(at, e2) * d11 - Dot(at, e1) * d12) / det, 0.0, 1.0));
   out.direction = Vec3f(w);
   out.distance_m = static_cast<float>(distance);
-  out.inverse_pdf_sr = static_cast<float>(solid_angle);
+  out.inverse_pdf_sr = static_cast<float>(solid_angle / warp_pdf);
   return out;
 }
 
@@ -438,7 +458,7 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
     }
     const Emitter& e = emitters_[choice->place];
     const std::optional<EmitterPoint> point =
-        SamplePoint(e, q.origin, std::min(static_cast<float>(u), 0.99999994f), v);
+        SamplePoint(e, q.origin, q.n, std::min(static_cast<float>(u), 0.99999994f), v);
     if (!point || !(Dot(q.n, point->direction) > 0.0f) || !(Dot(q.ng, point->direction) > 0.0f)) {
       ++counters.skipped_facing_away;
       continue;

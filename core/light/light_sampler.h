@@ -42,7 +42,8 @@ class LightSampler {
   // An unbiased estimate of the irradiance [W/m²] at surface point `p` (relative to the scene's
   // origin) on the side of unit geometric normal `ng`, against shading normal `n`
   // (Dot(n, ng) >= 0).
-  // - Emitters: `samples` >= 1 shadow rays to points drawn by a light tree, then by solid angle.
+  // - Emitters: `samples` >= 1 shadow rays to points drawn by a light tree, then by solid angle and
+  //   nearly by the cosine.
   // - Point and spot lights: one ray each if there are up to max(samples, kFewLights) of them, else
   //   `samples` rays to lights drawn by another tree. Directional lights: the same with their own
   //   number, drawn by their unshadowed irradiance, at a cost (without rays) of their number.
@@ -93,8 +94,10 @@ class LightSampler {
     float b1, b2;          // where on the triangle
     float inverse_pdf_sr;  // 1 / density per solid angle, given the emitter
   };
-  // (u, v) in [0, 1)² -> a direction from p; none where the emitter is seen edge-on.
-  std::optional<EmitterPoint> SamplePoint(const Emitter& e, const Vec3f& p, float u, float v) const;
+  // (u, v) in [0, 1)² -> a direction from p, by solid angle and nearly by the cosine to n; none
+  // where the emitter is seen edge-on.
+  std::optional<EmitterPoint> SamplePoint(const Emitter& e, const Vec3f& p, const Vec3f& n, float u,
+                                          float v) const;
 
   void AddEmitters();
   void AddPunctualLights();
