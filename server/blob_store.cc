@@ -212,6 +212,13 @@ absl::StatusOr<std::unique_ptr<BlobWriter>> BlobStore::StartPut(const Digest& di
   return std::make_unique<FileBlobWriter>(*this, digest, size_bytes, part, fd);
 }
 
+void BlobStore::Drop(const Digest& digest) {
+  std::lock_guard lock(mutex_);
+  memory_.erase(digest);
+  verified_.erase(digest);
+  if (!in_memory()) ::unlink(PathOf(digest).c_str());
+}
+
 size_t BlobStore::RemoveUnused(const std::set<Digest>& needed, std::chrono::seconds age) {
   if (in_memory()) return 0;
   size_t removed = 0;

@@ -35,6 +35,9 @@ class BlobStore {
   // kResourceExhausted if `size_bytes` is over the limit. The writer must not outlive the store.
   absl::StatusOr<std::unique_ptr<BlobWriter>> StartPut(const Digest& digest, uint64_t size_bytes);
 
+  // Forgets a blob; Blobs already handed out stay valid.
+  void Drop(const Digest& digest);
+
   // Removes the files that nobody put, got or asked for during the last `age`, except those in
   // `needed`; Blobs already handed out stay valid. Returns how many. In memory nothing is removed.
   size_t RemoveUnused(const std::set<Digest>& needed, std::chrono::seconds age);

@@ -13,6 +13,8 @@
 #include "core/base/check.h"
 #include "core/image/film.h"
 #include "server/blob_store.h"
+#include "server/explanation.h"
+#include "server/frame_bakery.h"
 #include "server/job_store.h"
 #include "server/scene_baker.h"
 #include "server/tile_scheduler.h"
@@ -26,6 +28,12 @@ constexpr size_t kMaxTilesPerJob = size_t{1} << 18;
 constexpr size_t kMaxMissingNamed = 5;
 constexpr uint32_t kMaxEventsPerCall = 256;
 constexpr std::chrono::milliseconds kMaxWait{30000};
+// The frames of a job are baked ahead of its tiles, but no further than this while there are tiles
+// enough for every worker: what is baked takes room.
+constexpr uint32_t kFramesAhead = 8;
+constexpr uint32_t kTilesAheadPerWorker = 4;
+constexpr size_t kSlowestTiles = 3;
+constexpr uint32_t kProblems = 5;
 
 int64_t UnixMs() {
   return std::chrono::duration_cast<std::chrono::milliseconds>(
@@ -71,6 +79,7 @@ class CoordinatorImpl final : public Coordinator {
         clock_(options_.clock ? options_.clock : std::make_shared<SteadyClock>()),
         blobs_(std::move(blobs)),
         store_(std::move(store)),
+        frame_bakery_(options_.baker, *blobs_, *store_),
         scheduler_(SchedulerOptionsOf(options_), *clock_) {}
 
   ~CoordinatorImpl() override {
@@ -78,7 +87,7 @@ class CoordinatorImpl final : public Coordinator {
       std::lock_guard lock(mutex_);
       stopping_ = true;
       draining_ = true;
-      for (auto& [id, job] : jobs_) job->stop_bake = true;
+      if (bake_in_work_) *bake_in_work_->stop = true;
     }
     changed_.notify_all();
     stop_ticker_.notify_all();
@@ -89,6 +98,7 @@ class CoordinatorImpl final : public Coordinator {
   absl::Status Recover() {
     FP_ASSIGN_OR_RETURN(std::vector<StoredJob> stored, store_->LoadJobs());
     for (StoredJob& one : stored) FP_RETURN_IF_ERROR(RecoverJob(std::move(one)));
+    FailOrphans();
     PurgeOld();
     ticker_ = std::thread([this] { TickLoop(); });
     bakery_ = std::thread([this] { BakeLoop(); });
@@ -119,13 +129,15 @@ class CoordinatorImpl final : public Coordinator {
     JobSpec spec = given;
     spec.limits = Smaller(spec.limits, options_.limits);
     FP_RETURN_IF_ERROR(ValidateJob(spec));
-    if (spec.frame_count() > 1 || !spec.after.empty() || spec.start_paused) return NotYet();
     std::vector<PixelRect> tiles = TilesOf(spec.film, static_cast<int>(spec.settings.tile_px));
-    if (tiles.size() > kMaxTilesPerJob) {
+    if (tiles.size() * spec.frame_count() > kMaxTilesPerJob) {
       return absl::InvalidArgumentError(
           "settings.tile_px is " + std::to_string(spec.settings.tile_px) + ", which makes " +
-          std::to_string(tiles.size()) + " tiles; at most " + std::to_string(kMaxTilesPerJob) +
-          " are allowed, ask for larger ones");
+          std::to_string(tiles.size()) + " tiles" +
+          (spec.frames.empty() ? std::string()
+                               : " in each of " + std::to_string(spec.frame_count()) + " frames") +
+          "; a job has at most " + std::to_string(kMaxTilesPerJob) +
+          ", ask for larger ones or for fewer frames");
     }
     if (submission_id.size() > 200) {
       return absl::InvalidArgumentError("submission_id is longer than 200 bytes");
@@ -146,6 +158,12 @@ class CoordinatorImpl final : public Coordinator {
     if (draining_) return Draining();
     FP_ASSIGN_OR_RETURN(const std::optional<JobId> known, store_->FindSubmission(submission_id));
     if (known) return *known;
+    for (const JobId& id : spec.after) {
+      if (!jobs_.contains(id)) {
+        return absl::NotFoundError("after: job '" + id.value +
+                                   "' is not known; `farpoint status` lists the jobs");
+      }
+    }
     auto job = std::make_shared<Job>();
     do {
       job->stored.id.value = RandomHex(8);
@@ -155,8 +173,10 @@ class CoordinatorImpl final : public Coordinator {
     job->tiles = std::move(tiles);
     FP_RETURN_IF_ERROR(store_->InsertJob(job->stored, submission_id));
     const JobId id = job->stored.id;
-    jobs_.emplace(id, std::move(job));
-    Log(CoordinatorLogEntry::Level::kInfo, "submitted", id);
+    jobs_.emplace(id, job);
+    TakeUp(*job, {});
+    Log(LogLevel::kInfo, "submitted", id);
+    FailOrphans();
     lock.unlock();
     changed_.notify_all();
     return id;
@@ -189,19 +209,93 @@ class CoordinatorImpl final : public Coordinator {
     FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
     if (IsFinal(job->stored.state)) return absl::OkStatus();
     FP_RETURN_IF_ERROR(store_->SetState(id, JobState::kCancelled, absl::OkStatus()));
+    Log(LogLevel::kInfo, "cancelled", id);
     EndJob(*job, JobState::kCancelled, absl::OkStatus());
-    Log(CoordinatorLogEntry::Level::kInfo, "cancelled", id);
     lock.unlock();
     changed_.notify_all();
     return absl::OkStatus();
   }
 
-  absl::Status Pause(const JobId&) override { return NotYet(); }
-  absl::Status Resume(const JobId&) override { return NotYet(); }
-  absl::Status SetPriority(const JobId&, int32_t) override { return NotYet(); }
-  absl::Status Requeue(const JobId&, bool) override { return NotYet(); }
-  absl::StatusOr<Explanation> Explain(const JobId&) override { return NotYet(); }
-  static absl::Status NotYet() { return absl::UnimplementedError("this call is not built yet"); }
+  absl::Status Pause(const JobId& id) override { return SetPaused(id, true); }
+  absl::Status Resume(const JobId& id) override { return SetPaused(id, false); }
+
+  absl::Status SetPriority(const JobId& id, int32_t priority) override {
+    if (priority < kMinPriority || priority > kMaxPriority) {
+      return absl::InvalidArgumentError("priority is " + std::to_string(priority) +
+                                        "; allowed: " + std::to_string(kMinPriority) + " to " +
+                                        std::to_string(kMaxPriority));
+    }
+    std::unique_lock lock(mutex_);
+    FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+    if (job->stored.spec.priority == priority) return absl::OkStatus();
+    FP_RETURN_IF_ERROR(store_->SetPriority(id, priority));
+    job->stored.spec.priority = priority;
+    scheduler_.SetPriority(id, priority);
+    if (!IsFinal(job->stored.state)) {
+      JobLog(*job, {.text = "the priority is " + std::to_string(priority) + " now"});
+    }
+    lock.unlock();
+    changed_.notify_all();
+    return absl::OkStatus();
+  }
+
+  absl::Status Requeue(const JobId& id, bool all) override {
+    // One at a time: a job that has ended stays so until this one takes it up.
+    std::lock_guard requeue(requeue_mutex_);
+    bool had_ended = false;
+    {
+      std::lock_guard lock(mutex_);
+      FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+      if (job->stored.state == JobState::kDone && !all) return absl::OkStatus();
+      had_ended = IsFinal(job->stored.state);
+    }
+    // Reads every tile of the job: without the lock.
+    if (had_ended && !all) FP_RETURN_IF_ERROR(store_->DropDamagedTiles(id).status());
+    std::unique_lock lock(mutex_);
+    if (draining_) return Draining();
+    FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+    StoredJob& stored = job->stored;
+    const bool ended = IsFinal(stored.state);
+    if (!all && (stored.state == JobState::kDone || ended != had_ended)) return absl::OkStatus();
+    if (!ended && !all) {
+      scheduler_.ForgetFailures(id);
+      JobLog(*job, {.text = "requeued: earlier failures are forgotten"});
+    } else {
+      if (ended) FP_RETURN_IF_ERROR(MayStartAgain(*job));
+      FP_RETURN_IF_ERROR(store_->Requeue(id, all));
+      if (ended) {
+        stored.error = absl::OkStatus();
+        stored.paused = false;
+        stored.state = JobState::kQueued;
+      } else {
+        RememberCounters(*job);
+        scheduler_.RemoveJob(id);
+      }
+      if (all) stored.fingerprint = {};
+      FP_ASSIGN_OR_RETURN(const std::vector<StoredTile> committed, store_->Tiles(id));
+      ++job->changes;
+      TakeUp(*job, committed);
+      JobLog(*job, {.text = all ? "requeued with all tiles" : "requeued"});
+      FinishIfDone(*job);
+    }
+    lock.unlock();
+    changed_.notify_all();
+    return absl::OkStatus();
+  }
+
+  absl::StatusOr<Explanation> Explain(const JobId& id) override {
+    ExplanationFacts facts;
+    {
+      std::lock_guard lock(mutex_);
+      FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+      facts = FactsOf(*job);
+    }
+    FP_ASSIGN_OR_RETURN(facts.slowest, store_->SlowestTiles(id, kSlowestTiles));
+    FP_ASSIGN_OR_RETURN(facts.problems, store_->LastLogLines(id, LogLevel::kWarning, kProblems));
+    FP_ASSIGN_OR_RETURN(facts.bake_stats, store_->BakeStats(id));
+    FP_ASSIGN_OR_RETURN(facts.tile_stats, store_->TileStats(id));
+    return farpoint::Explain(facts);
+  }
 
   absl::StatusOr<std::vector<JobEvent>> NextEvents(const JobId& id, uint64_t after_sequence,
                                                    std::chrono::milliseconds wait) override {
@@ -223,7 +317,10 @@ class CoordinatorImpl final : public Coordinator {
         std::vector<JobEvent> events;
         const JobStatus status = StatusOf(*job);
         for (const StoredEvent& event : stored) {
-          events.push_back({.sequence = event.sequence, .body = event.body, .status = status});
+          events.push_back({.sequence = event.sequence,
+                            .body = event.body,
+                            .status = status,
+                            .unix_ms = event.unix_ms});
         }
         return events;
       }
@@ -232,36 +329,43 @@ class CoordinatorImpl final : public Coordinator {
           lock, deadline, [&] { return stopping_ || draining_ || job->changes != seen; });
       if (woken && job->changes != seen) continue;
       if (woken) return Draining();
-      return std::vector<JobEvent>{{.sequence = 0, .body = {}, .status = StatusOf(*job)}};
+      return std::vector<JobEvent>{
+          {.sequence = 0, .body = {}, .status = StatusOf(*job), .unix_ms = UnixMs()}};
     }
   }
 
   absl::StatusOr<JobInfo> FetchInfo(const JobId& id) override {
     JobInfo info;
-    std::optional<Camera> camera;
     {
       std::lock_guard lock(mutex_);
       FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
       info.status = StatusOf(*job);
       info.spec = job->stored.spec;
       info.notes = job->stored.notes;
-      info.frames.resize(1);
-      info.frames[0].number = info.spec.frame_number(0);
-      info.frames[0].blobs = job->stored.blobs;
-      info.stats = job->stored.bake_stats;
-      camera = job->stored.camera;
-      if (camera) {
-        for (const PixelRect& rect : job->tiles) info.tiles.push_back({.rect = rect});
+      info.frames.resize(info.spec.frame_count());
+      for (uint32_t i = 0; i < info.frames.size(); ++i) {
+        info.frames[i].number = info.spec.frame_number(i);
+      }
+      for (const auto& [index, baked] : job->stored.frames) {
+        FrameInfo& frame = info.frames[index];
+        frame.baked = true;
+        frame.camera = MatricesOf(baked.camera, info.spec.film);
+        frame.blobs = baked.blobs;
+      }
+      if (!job->stored.frames.empty()) {
+        info.tiles.reserve(job->total_tiles());
+        for (uint32_t i = 0; i < info.frames.size(); ++i) {
+          for (const PixelRect& rect : job->tiles) info.tiles.push_back({.rect = rect, .frame = i});
+        }
       }
     }
     info.version = FARPOINT_VERSION;
-    if (!camera) return info;
-    info.frames[0].baked = true;
-    info.frames[0].camera = MatricesOf(*camera, info.spec.film);
+    if (info.tiles.empty()) return info;
     FP_ASSIGN_OR_RETURN(const std::vector<StoredTile> committed, store_->Tiles(id));
     for (const StoredTile& tile : committed) {
       if (tile.tile < info.tiles.size()) info.tiles[tile.tile].sha256 = tile.sha256;
     }
+    FP_ASSIGN_OR_RETURN(info.stats, store_->BakeStats(id));
     FP_ASSIGN_OR_RETURN(const Stats stats, store_->TileStats(id));
     info.stats += stats;
     return info;
@@ -271,9 +375,9 @@ class CoordinatorImpl final : public Coordinator {
     {
       std::lock_guard lock(mutex_);
       FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
-      if (tile >= job->tiles.size()) {
+      if (tile >= job->total_tiles()) {
         return absl::InvalidArgumentError("tile " + std::to_string(tile) + " is not among the " +
-                                          std::to_string(job->tiles.size()) + " of job " +
+                                          std::to_string(job->total_tiles()) + " of job " +
                                           id.value);
       }
     }
@@ -299,7 +403,7 @@ class CoordinatorImpl final : public Coordinator {
     welcome.heartbeat = options_.heartbeat;
     welcome.max_wait = std::chrono::milliseconds(10000);
     scheduler_.AddWorker(welcome.id, hello);
-    LogWorker(CoordinatorLogEntry::Level::kInfo,
+    LogWorker(LogLevel::kInfo,
               "registered '" + hello.name + "', " + std::to_string(hello.threads) + " threads",
               welcome.id);
     return welcome;
@@ -314,18 +418,19 @@ class CoordinatorImpl final : public Coordinator {
       if (!scheduler_.HasWorker(worker)) return UnknownWorker(worker);
       if (const std::optional<LeaseGrant> grant = scheduler_.Lease(worker)) {
         const Job& job = *jobs_.at(grant->job);
-        LogLease(CoordinatorLogEntry::Level::kInfo, grant->speculative ? "copied" : "leased",
-                 *grant);
+        LogLease(LogLevel::kInfo, grant->speculative ? "copied" : "leased", *grant);
         TileWork work;
         work.lease = grant->lease;
         work.attempt = grant->attempt;
         work.job = grant->job;
         work.tile = grant->tile;
-        work.rect = job.tiles[grant->tile];
-        work.frame = {.camera = *job.stored.camera,
+        work.rect = job.tiles[grant->tile % job.tiles.size()];
+        work.frame_index = job.frame_of(grant->tile);
+        const StoredFrame& frame = job.stored.frames.at(work.frame_index);
+        work.frame = {.camera = frame.camera,
                       .film = job.stored.spec.film,
                       .settings = job.stored.spec.settings};
-        work.blobs = job.stored.blobs;
+        work.blobs = frame.blobs;
         work.lease_time = std::max(options_.lease_time, BlockTime(job.stored.spec.settings));
         return work;
       }
@@ -355,17 +460,21 @@ class CoordinatorImpl final : public Coordinator {
           scheduler_.BeginCommit(worker, result.lease, result.attempt);
       if (!begun.ok()) {
         const std::string reason(begun.status().message());
-        LogWorker(CoordinatorLogEntry::Level::kWarning,
+        LogWorker(LogLevel::kWarning,
                   "refused a result of lease " + result.lease.value + ": " + reason, worker);
+        const auto at = jobs_.find(scheduler_.JobOf(result.lease));
+        if (at != jobs_.end() && !IsFinal(at->second->stored.state)) {
+          JobLog(*at->second, {.level = LogLevel::kWarning,
+                               .text = "a result was refused: " + reason,
+                               .worker = WorkerName(worker)});
+        }
         return ReturnAnswer{.accepted = false, .reason = reason};
       }
       grant = *begun;
       const Job& job = *jobs_.at(grant.job);
-      rect = job.tiles[grant.tile];
+      rect = job.tiles[grant.tile % job.tiles.size()];
       layers = job.stored.spec.settings.layers;
-      for (const WorkerStatus& status : scheduler_.Workers()) {
-        if (status.id == worker) fingerprint = status.fingerprint;
-      }
+      fingerprint = scheduler_.FindWorker(worker)->fingerprint;
     }
 
     // Reading and storing take their time: without the lock. The lease is pinned meanwhile.
@@ -381,27 +490,24 @@ class CoordinatorImpl final : public Coordinator {
 
     std::unique_lock lock(mutex_);
     const bool counted = scheduler_.FinishCommit(result.lease, stored.ok());
-    if (const auto at = jobs_.find(grant.job); at != jobs_.end()) {
+    const auto at = jobs_.find(grant.job);
+    if (stored.ok() && at != jobs_.end()) {
       Job& job = *at->second;
-      if (stored.ok()) {
-        ++job.changes;
+      ++job.changes;
+      if (counted) {
         if (job.stored.fingerprint.empty()) job.stored.fingerprint = fingerprint;
-      }
-      const TileCounts counts = scheduler_.Counts(grant.job);
-      if (stored.ok() && counted && counts.committed == counts.total &&
-          job.stored.state == JobState::kRendering) {
-        // If this fails or the process dies first, the store is opened again with all tiles
-        // committed, and the job is found done.
-        const absl::Status done = store_->SetState(grant.job, JobState::kDone, absl::OkStatus());
-        if (!done.ok()) LogLease(CoordinatorLogEntry::Level::kError, done.ToString(), grant);
-        EndJob(job, JobState::kDone, absl::OkStatus());
-        Log(CoordinatorLogEntry::Level::kInfo, "done", grant.job);
+        CountCommitted(job, grant.tile);
+        FinishIfDone(job);
+      } else if (!IsFinal(job.stored.state)) {
+        // The job was taken up anew while this was stored, and knows nothing of the tile.
+        stored = store_->DropTiles(grant.job, {grant.tile});
+        if (stored.ok()) stored = absl::FailedPreconditionError("the job was requeued meanwhile");
       }
     }
     if (stored.ok()) {
-      LogLease(CoordinatorLogEntry::Level::kInfo, "committed", grant);
+      LogLease(LogLevel::kInfo, "committed", grant);
     } else {
-      LogLease(CoordinatorLogEntry::Level::kError, "not committed: " + stored.ToString(), grant);
+      LogLease(LogLevel::kError, "not committed: " + stored.ToString(), grant);
     }
     lock.unlock();
     changed_.notify_all();
@@ -419,6 +525,15 @@ class CoordinatorImpl final : public Coordinator {
     if (!given_back && error.ok()) {
       return absl::InvalidArgumentError("a failure was reported without an error");
     }
+    if (given_back) {
+      const std::optional<LeaseGrant> grant = scheduler_.FindLease(lease);
+      if (grant && grant->worker == worker) {
+        JobLog(*jobs_.at(grant->job), {.text = "given back",
+                                       .tile = grant->tile,
+                                       .attempt = grant->attempt,
+                                       .worker = WorkerName(worker)});
+      }
+    }
     HandleNews(scheduler_.ReportFailure(worker, lease, given_back, error));
     lock.unlock();
     changed_.notify_all();
@@ -429,7 +544,7 @@ class CoordinatorImpl final : public Coordinator {
     std::unique_lock lock(mutex_);
     if (!scheduler_.HasWorker(worker)) return absl::OkStatus();
     scheduler_.RemoveWorker(worker);
-    LogWorker(CoordinatorLogEntry::Level::kInfo, "left", worker);
+    LogWorker(LogLevel::kInfo, "left", worker);
     lock.unlock();
     changed_.notify_all();
     return absl::OkStatus();
@@ -450,10 +565,31 @@ class CoordinatorImpl final : public Coordinator {
  private:
   struct Job {
     StoredJob stored;
-    std::vector<PixelRect> tiles;
-    uint64_t changes = 1;     // grows with each event
-    TileCounts final_counts;  // once the state is final
-    std::atomic<bool> stop_bake = false;
+    std::vector<PixelRect> tiles;  // of one frame
+    uint64_t changes = 1;          // grows with each event
+    uint64_t life = 0;             // grows when it ends and when it is taken up again
+    TileCounts final_counts;       // once the state is final
+    // By frame:
+    std::vector<uint32_t> committed;  // tiles
+    std::vector<bool> ready;          // its tiles may be leased, or are all committed
+    uint32_t frames_done = 0;
+    uint32_t next_bake = 0;  // frames before it are ready
+    bool begun = false;      // a frame was baked: it waits for no other job any more
+    bool animated = false;   // its frames have blobs of their own
+
+    uint32_t total_tiles() const {
+      return static_cast<uint32_t>(tiles.size()) * stored.spec.frame_count();
+    }
+    uint32_t frame_of(uint32_t tile) const { return tile / static_cast<uint32_t>(tiles.size()); }
+    bool has_frames_to_bake() const { return next_bake < ready.size(); }
+  };
+  // Held by the baking thread, looked at and stopped by others.
+  struct BakeInWork {
+    JobId job;
+    uint32_t frame = 0;
+    uint64_t life = 0;
+    TimePoint since;
+    std::shared_ptr<std::atomic<bool>> stop = std::make_shared<std::atomic<bool>>(false);
   };
 
   static absl::Status Draining() {
@@ -483,84 +619,293 @@ class CoordinatorImpl final : public Coordinator {
     status.submitted_unix_ms = stored.submitted_unix_ms;
     status.reissued = stored.reissued + scheduler_.Reissued(stored.id);
     status.refused_results = stored.refused_results + scheduler_.Refused(stored.id);
+    status.after = stored.spec.after;
+    status.frames = {.total = stored.spec.frame_count(),
+                     .baked = static_cast<uint32_t>(stored.frames.size()),
+                     .done = job.frames_done};
     if (IsFinal(stored.state)) {
       status.tiles = job.final_counts;
       status.progress = status.tiles.total == 0
                             ? 0
                             : static_cast<double>(status.tiles.committed) / status.tiles.total;
       if (stored.state == JobState::kDone) status.eta_s = 0;
-    } else if (scheduler_.HasJob(stored.id)) {
-      status.tiles = scheduler_.Counts(stored.id);
-      status.progress = scheduler_.Progress(stored.id);
-      status.eta_s = scheduler_.EtaSeconds(stored.id);
-    } else {
-      status.tiles.total = status.tiles.queued = static_cast<uint32_t>(job.tiles.size());
+      return status;
     }
+    if (stored.paused) status.state = JobState::kPaused;
+    status.tiles = scheduler_.Counts(stored.id);
+    status.progress = scheduler_.Progress(stored.id);
+    status.eta_s = scheduler_.EtaSeconds(stored.id);
     return status;
   }
 
-  // The store knows already. What is not committed will never be: it counts as failed.
-  void EndJob(Job& job, JobState state, const absl::Status& error) {
+  // Counts of a job that has ended: what is not committed never failed if the job was cancelled.
+  static TileCounts FinalCounts(JobState state, uint32_t committed, uint32_t total) {
+    TileCounts counts{.committed = committed, .total = total};
+    (state == JobState::kCancelled ? counts.queued : counts.failed) = total - committed;
+    return counts;
+  }
+
+  // What the scheduler has counted stays with the job when it is removed there.
+  void RememberCounters(Job& job) {
+    job.stored.reissued += scheduler_.Reissued(job.stored.id);
+    job.stored.refused_results += scheduler_.Refused(job.stored.id);
+    SaveCounters(job, job.stored.reissued, job.stored.refused_results);
+  }
+
+  // The store knows already.
+  void EndOne(Job& job, JobState state, const absl::Status& error) {
     const JobId& id = job.stored.id;
-    const uint32_t total = static_cast<uint32_t>(job.tiles.size());
-    const uint32_t committed = scheduler_.Counts(id).committed;
-    job.final_counts = {.committed = committed, .failed = total - committed, .total = total};
+    job.final_counts = FinalCounts(state, scheduler_.Counts(id).committed, job.total_tiles());
     job.stored.state = state;
     job.stored.error = error;
-    job.stored.reissued += scheduler_.Reissued(id);
-    job.stored.refused_results += scheduler_.Refused(id);
-    job.stop_bake = true;
+    job.stored.paused = false;
+    ++job.life;
     ++job.changes;
+    RememberCounters(job);
     scheduler_.RemoveJob(id);
-    SaveCounters(job, job.stored.reissued, job.stored.refused_results);
+    if (bake_in_work_ && bake_in_work_->job == id) *bake_in_work_->stop = true;
+  }
+
+  // And with it those that wait for it, unless it is done.
+  void EndJob(Job& job, JobState state, const absl::Status& error) {
+    EndOne(job, state, error);
+    if (state != JobState::kDone) FailOrphans();
+  }
+
+  void FailOne(Job& job, const absl::Status& error) {
+    // Not this program's error: whoever watches the job gets it in full.
+    Log(LogLevel::kInfo, "failed: " + std::string(error.message()), job.stored.id);
+    const absl::Status stored = store_->SetState(job.stored.id, JobState::kFailed, error);
+    if (!stored.ok()) {
+      Log(LogLevel::kError, "failure not stored: " + stored.ToString(), job.stored.id);
+    }
+    EndOne(job, JobState::kFailed, error);
+  }
+  void FailJob(Job& job, const absl::Status& error) {
+    FailOne(job, error);
+    FailOrphans();
+  }
+
+  // Jobs that wait for one that will not be done.
+  void FailOrphans() {
+    // A chain of jobs falls from its first to its last: again until nothing falls.
+    for (bool failed = true; failed;) {
+      failed = false;
+      for (auto& [id, job] : jobs_) {
+        if (IsFinal(job->stored.state) || job->begun) continue;
+        const absl::Status lost = LostDependency(*job);
+        if (lost.ok()) continue;
+        FailOne(*job, lost);
+        failed = true;
+      }
+    }
+  }
+
+  // OK unless a job that this one waits for has ended badly or is not known.
+  absl::Status LostDependency(const Job& job) const {
+    for (const JobId& id : job.stored.spec.after) {
+      const auto at = jobs_.find(id);
+      if (at == jobs_.end()) {
+        return absl::NotFoundError("it waits for job " + id.value +
+                                   ", which is not known any more; submit both again");
+      }
+      const StoredJob& other = at->second->stored;
+      if (other.state == JobState::kFailed || other.state == JobState::kCancelled) {
+        return absl::FailedPreconditionError(
+            "it waits for job " + id.value + ", which " +
+            (other.state == JobState::kFailed ? "failed" : "was cancelled") +
+            "; requeue that one, then this one");
+      }
+    }
+    return absl::OkStatus();
+  }
+  bool WaitsForOthers(const Job& job) const {
+    if (job.begun) return false;
+    for (const JobId& id : job.stored.spec.after) {
+      const auto at = jobs_.find(id);
+      if (at == jobs_.end() || at->second->stored.state != JobState::kDone) return true;
+    }
+    return false;
+  }
+
+  absl::Status MayStartAgain(const Job& job) const {
+    if (!job.begun) FP_RETURN_IF_ERROR(LostDependency(job));
+    for (const auto& [uri, digest] : job.stored.spec.asset_files) {
+      if (!blobs_->Contains(digest)) {
+        return absl::FailedPreconditionError("the scene's file '" + uri +
+                                             "' is gone; submit the job again");
+      }
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status SetPaused(const JobId& id, bool paused) {
+    std::unique_lock lock(mutex_);
+    FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+    if (IsFinal(job->stored.state) || job->stored.paused == paused) return absl::OkStatus();
+    FP_RETURN_IF_ERROR(store_->SetPaused(id, paused));
+    job->stored.paused = paused;
+    ++job->changes;
+    scheduler_.SetPaused(id, paused);
+    Log(LogLevel::kInfo, paused ? "paused" : "resumed", id);
+    lock.unlock();
+    changed_.notify_all();
+    return absl::OkStatus();
   }
 
   void SaveCounters(const Job& job, uint64_t reissued, uint64_t refused) {
     const absl::Status saved = store_->SaveCounters(job.stored.id, reissued, refused);
     if (!saved.ok()) {
-      Log(CoordinatorLogEntry::Level::kError, "counters not saved: " + saved.ToString(),
-          job.stored.id);
+      Log(LogLevel::kError, "counters not saved: " + saved.ToString(), job.stored.id);
     }
-  }
-
-  void FailJob(Job& job, const absl::Status& error) {
-    const absl::Status stored = store_->SetState(job.stored.id, JobState::kFailed, error);
-    if (!stored.ok()) {
-      Log(CoordinatorLogEntry::Level::kError, "failure not stored: " + stored.ToString(),
-          job.stored.id);
-    }
-    EndJob(job, JobState::kFailed, error);
-    // Not this program's error: whoever watches the job gets it in full.
-    Log(CoordinatorLogEntry::Level::kInfo, "failed: " + std::string(error.message()),
-        job.stored.id);
   }
 
   void HandleNews(const SchedulerNews& news) {
     for (const LostLease& lost : news.lost) {
-      LogLease(CoordinatorLogEntry::Level::kWarning, "lease lost: " + lost.reason, lost.grant);
-    }
-    for (const FailedJob& failed : news.failed) {
-      if (const auto at = jobs_.find(failed.job); at != jobs_.end()) {
-        FailJob(*at->second, failed.error);
+      std::string text = "lease lost: " + lost.reason;
+      if (lost.worker_set_aside) text += "; the worker is set aside for a while";
+      LogLease(LogLevel::kWarning, text, lost.grant);
+      if (const auto at = jobs_.find(lost.grant.job); at != jobs_.end()) {
+        JobLog(*at->second, {.level = LogLevel::kWarning,
+                             .text = text,
+                             .tile = lost.grant.tile,
+                             .attempt = lost.grant.attempt,
+                             .worker = lost.worker_name});
       }
     }
+    for (const FailedJob& failed : news.failed) {
+      const auto at = jobs_.find(failed.job);
+      if (at == jobs_.end() || IsFinal(at->second->stored.state)) continue;
+      Job& job = *at->second;
+      absl::Status error = failed.error;
+      if (failed.tile && !job.stored.spec.frames.empty()) {
+        error = Annotate(error, FrameName(job, job.frame_of(*failed.tile)));
+      }
+      FailJob(job, error);
+    }
     for (const WorkerId& worker : news.forgotten) {
-      LogWorker(CoordinatorLogEntry::Level::kInfo, "forgotten: silent for too long", worker);
+      LogWorker(LogLevel::kInfo, "forgotten: silent for too long", worker);
     }
   }
 
-  void StartRendering(Job& job, const std::vector<StoredTile>& committed) {
+  static std::string FrameName(const Job& job, uint32_t index) {
+    return "frame " + std::to_string(job.stored.spec.frame_number(index));
+  }
+
+  bool HaveBlobs(const SceneBlobs& blobs) const {
+    for (const Digest& d : {blobs.prepared_scene, blobs.tree_topology, blobs.tree_radiance}) {
+      if (!d.empty() && !blobs_->Contains(d)) return false;
+    }
+    return true;
+  }
+
+  // A job that is not final begins, or goes on where `committed` and its baked frames are. It is
+  // not with the scheduler yet.
+  void TakeUp(Job& job, const std::vector<StoredTile>& committed) {
+    StoredJob& stored = job.stored;
+    const uint32_t frames = stored.spec.frame_count();
+    const auto frame_tiles = static_cast<uint32_t>(job.tiles.size());
+    ++job.life;
+    job.frames_done = 0;
+    job.next_bake = 0;
+    job.committed.assign(frames, 0);
+    job.ready.assign(frames, false);
+    if (!stored.frames.empty()) job.begun = true;
+
     ScheduledJob scheduled;
-    scheduled.id = job.stored.id;
-    scheduled.priority = job.stored.spec.priority;
-    scheduled.number = job.stored.number;
-    scheduled.tiles = static_cast<uint32_t>(job.tiles.size());
-    for (const StoredTile& tile : committed) scheduled.committed.push_back(tile.tile);
-    if (!committed.empty()) scheduled.fingerprint = job.stored.fingerprint;
-    scheduled.max_time = std::chrono::seconds(job.stored.spec.limits.max_seconds);
-    scheduled.lease_time = BlockTime(job.stored.spec.settings);
-    job.stored.state = JobState::kRendering;
+    scheduled.id = stored.id;
+    scheduled.priority = stored.spec.priority;
+    scheduled.number = stored.number;
+    scheduled.tiles = job.total_tiles();
+    for (const StoredTile& tile : committed) {
+      if (tile.tile >= scheduled.tiles) continue;
+      scheduled.committed.push_back(tile.tile);
+      ++job.committed[job.frame_of(tile.tile)];
+    }
+    if (!committed.empty()) scheduled.fingerprint = stored.fingerprint;
+    scheduled.max_time = std::chrono::seconds(stored.spec.limits.max_seconds);
+    scheduled.lease_time = BlockTime(stored.spec.settings);
+    scheduled.open = false;
+    scheduled.paused = stored.paused;
     scheduler_.AddJob(scheduled);
+
+    for (uint32_t i = 0; i < frames; ++i) {
+      const bool done = job.committed[i] == frame_tiles;
+      if (done) ++job.frames_done;
+      const auto baked = stored.frames.find(i);
+      if (baked == stored.frames.end()) continue;
+      if (done) {
+        job.ready[i] = true;
+      } else if (HaveBlobs(baked->second.blobs)) {
+        job.ready[i] = true;
+        scheduler_.OpenTiles(stored.id, i * frame_tiles, frame_tiles);
+      } else {
+        stored.frames.erase(baked);  // baked again
+      }
+    }
+    AdvanceNextBake(job);
+    stored.state = stored.frames.empty() ? JobState::kQueued : JobState::kRendering;
+  }
+
+  static void AdvanceNextBake(Job& job) {
+    while (job.has_frames_to_bake() && job.ready[job.next_bake]) ++job.next_bake;
+  }
+
+  void CountCommitted(Job& job, uint32_t tile) {
+    const uint32_t frame = job.frame_of(tile);
+    if (++job.committed[frame] < job.tiles.size()) return;
+    ++job.frames_done;
+    if (!job.stored.spec.frames.empty()) {
+      Log(LogLevel::kInfo, FrameName(job, frame) + " is done", job.stored.id);
+    }
+    ReleaseBlobs(job, frame);
+  }
+
+  void FinishIfDone(Job& job) {
+    const JobId& id = job.stored.id;
+    const TileCounts counts = scheduler_.Counts(id);
+    if (IsFinal(job.stored.state) || counts.committed != counts.total) return;
+    // If this fails or the process dies first, the store is opened again with all tiles committed,
+    // and the job is found done.
+    const absl::Status done = store_->SetState(id, JobState::kDone, absl::OkStatus());
+    if (!done.ok()) Log(LogLevel::kError, done.ToString(), id);
+    EndJob(job, JobState::kDone, absl::OkStatus());
+    Log(LogLevel::kInfo, "done", id);
+  }
+
+  // Blobs that unfinished frames need, and those that a job needs to be requeued.
+  std::set<Digest> NeededBlobs() const {
+    std::set<Digest> needed;
+    for (const auto& [id, job] : jobs_) {
+      for (const auto& [uri, digest] : job->stored.spec.asset_files) needed.insert(digest);
+      if (job->stored.state == JobState::kDone) continue;
+      for (const auto& [index, frame] : job->stored.frames) {
+        if (index < job->committed.size() && job->committed[index] == job->tiles.size()) continue;
+        needed.insert(frame.blobs.prepared_scene);
+        needed.insert(frame.blobs.tree_topology);
+        needed.insert(frame.blobs.tree_radiance);
+      }
+    }
+    return needed;
+  }
+
+  // In memory the blobs of an animated scene's frames go when they are rendered: hundreds of frames
+  // would not fit. On a disk they stay until the retention time is over.
+  void ReleaseBlobs(const Job& job, uint32_t frame) {
+    const auto at = job.stored.frames.find(frame);
+    if (!options_.store_directory.empty() || !job.animated || at == job.stored.frames.end()) return;
+    const SceneBlobs& blobs = at->second.blobs;
+    released_.insert({blobs.prepared_scene, blobs.tree_topology, blobs.tree_radiance});
+    DropReleased();
+  }
+  // What is being baked may turn out to be one of them: later.
+  void DropReleased() {
+    if (bake_in_work_ || released_.empty()) return;
+    const std::set<Digest> needed = NeededBlobs();
+    for (const Digest& d : released_) {
+      if (!needed.contains(d)) blobs_->Drop(d);
+    }
+    released_.clear();
   }
 
   // Before the threads start: needs no lock.
@@ -574,37 +919,36 @@ class CoordinatorImpl final : public Coordinator {
     }
     jobs_.emplace(id, job);
     FP_ASSIGN_OR_RETURN(std::vector<StoredTile> committed, store_->Tiles(id));
-    const uint32_t total = static_cast<uint32_t>(job->tiles.size());
+    const uint32_t total = job->total_tiles();
     if (IsFinal(s.state)) {
+      s.paused = false;
       const uint32_t done = std::min(total, static_cast<uint32_t>(committed.size()));
-      job->final_counts = {.committed = done, .failed = total - done, .total = total};
+      job->final_counts = FinalCounts(s.state, done, total);
+      job->committed.assign(s.spec.frame_count(), 0);
+      for (const StoredTile& tile : committed) {
+        if (tile.tile < total) ++job->committed[job->frame_of(tile.tile)];
+      }
+      for (const uint32_t count : job->committed) {
+        if (total > 0 && count == job->tiles.size()) ++job->frames_done;
+      }
       // Refused by this version: the store may not know it yet.
       if (s.state == JobState::kFailed) (void)store_->SetState(id, s.state, s.error);
       return absl::OkStatus();
     }
     FP_ASSIGN_OR_RETURN(const std::vector<uint32_t> damaged, store_->DropDamagedTiles(id));
     if (!damaged.empty()) {
-      Log(CoordinatorLogEntry::Level::kWarning,
+      Log(LogLevel::kWarning,
           std::to_string(damaged.size()) + " tiles were damaged and are rendered again", id);
       FP_ASSIGN_OR_RETURN(committed, store_->Tiles(id));
     }
-    if (s.state == JobState::kRendering && committed.size() == total) {
-      FP_RETURN_IF_ERROR(store_->SetState(id, JobState::kDone, absl::OkStatus()));
-      s.state = JobState::kDone;
-      job->final_counts = {.committed = total, .total = total};
-      return absl::OkStatus();
-    }
-    const auto have = [this](const Digest& d) { return d.empty() || blobs_->Contains(d); };
-    if (s.state == JobState::kRendering && s.camera && have(s.blobs.prepared_scene) &&
-        have(s.blobs.tree_topology) && have(s.blobs.tree_radiance)) {
-      StartRendering(*job, committed);
-      Log(CoordinatorLogEntry::Level::kInfo,
+    TakeUp(*job, committed);
+    if (s.state == JobState::kRendering) {
+      Log(LogLevel::kInfo,
           "taken up again, " + std::to_string(committed.size()) + " of " + std::to_string(total) +
               " tiles are done",
           id);
-    } else {
-      s.state = JobState::kQueued;  // baked again
     }
+    FinishIfDone(*job);
     return absl::OkStatus();
   }
 
@@ -667,178 +1011,203 @@ class CoordinatorImpl final : public Coordinator {
     const int64_t before =
         UnixMs() -
         std::chrono::duration_cast<std::chrono::milliseconds>(options_.retention).count();
-    const absl::StatusOr<std::vector<JobId>> purged = store_->Purge(before);
+    std::set<JobId> waited_for;
+    for (const auto& [id, job] : jobs_) {
+      if (IsFinal(job->stored.state) || job->begun) continue;
+      waited_for.insert(job->stored.spec.after.begin(), job->stored.spec.after.end());
+    }
+    const absl::StatusOr<std::vector<JobId>> purged = store_->Purge(before, waited_for);
     if (!purged.ok()) {
-      Log(CoordinatorLogEntry::Level::kError, "purge: " + purged.status().ToString(), {});
+      Log(LogLevel::kError, "purge: " + purged.status().ToString(), {});
       return;
     }
     for (const JobId& id : *purged) {
       jobs_.erase(id);
       saved_counters_.erase(id);
-      Log(CoordinatorLogEntry::Level::kInfo, "purged", id);
+      Log(LogLevel::kInfo, "purged", id);
     }
-    std::set<Digest> needed;
+    blobs_->RemoveUnused(NeededBlobs(), options_.retention);
+  }
+
+  // Whether enough of the job is baked for now.
+  bool EnoughBaked(const Job& job) const {
+    const auto ahead = static_cast<uint32_t>(job.stored.frames.size()) - job.frames_done;
+    return ahead >= kFramesAhead &&
+           scheduler_.Leasable(job.stored.id) >= kTilesAheadPerWorker * scheduler_.worker_count();
+  }
+
+  // The jobs whose next frame waits to be baked, in the order in which they will be.
+  std::vector<std::shared_ptr<Job>> BakeQueue() const {
+    std::vector<std::shared_ptr<Job>> queue;
     for (const auto& [id, job] : jobs_) {
-      if (IsFinal(job->stored.state)) continue;
-      for (const auto& [uri, digest] : job->stored.spec.asset_files) needed.insert(digest);
-      needed.insert(job->stored.blobs.prepared_scene);
-      needed.insert(job->stored.blobs.tree_topology);
-      needed.insert(job->stored.blobs.tree_radiance);
+      if (IsFinal(job->stored.state) || job->stored.paused || !job->has_frames_to_bake() ||
+          WaitsForOthers(*job) || EnoughBaked(*job)) {
+        continue;
+      }
+      if (bake_in_work_ && bake_in_work_->job == id && bake_in_work_->life == job->life) continue;
+      queue.push_back(job);
     }
-    blobs_->RemoveUnused(needed, options_.retention);
+    std::sort(queue.begin(), queue.end(),
+              [](const auto& a, const auto& b) { return GoesBefore(a->stored, b->stored); });
+    return queue;
+  }
+  static bool GoesBefore(const StoredJob& a, const StoredJob& b) {
+    if (a.spec.priority != b.spec.priority) return a.spec.priority > b.spec.priority;
+    return a.number < b.number;
   }
 
   void BakeLoop() {
     std::unique_lock lock(mutex_);
     while (!stopping_) {
-      std::shared_ptr<Job> next;
-      for (const auto& [id, job] : jobs_) {
-        if (draining_ || job->stored.state != JobState::kQueued) continue;
-        if (next == nullptr || job->stored.spec.priority > next->stored.spec.priority ||
-            (job->stored.spec.priority == next->stored.spec.priority &&
-             job->stored.number < next->stored.number)) {
-          next = job;
-        }
-      }
-      if (next == nullptr) {
+      const std::vector<std::shared_ptr<Job>> queue =
+          draining_ ? std::vector<std::shared_ptr<Job>>() : BakeQueue();
+      if (queue.empty()) {
         changed_.wait(lock);
         continue;
       }
-      const JobId id = next->stored.id;
-      if (const absl::Status s = store_->SetState(id, JobState::kBaking, absl::OkStatus());
-          !s.ok()) {
-        FailJob(*next, s);
+      const std::shared_ptr<Job> job = queue.front();
+      const JobId id = job->stored.id;
+      if (job->stored.state == JobState::kQueued) {
+        if (const absl::Status s = store_->SetState(id, JobState::kBaking, absl::OkStatus());
+            !s.ok()) {
+          FailJob(*job, s);
+          changed_.notify_all();
+          continue;
+        }
+        job->stored.state = JobState::kBaking;
+        ++job->changes;
         changed_.notify_all();
+      }
+      BakeInWork work{
+          .job = id, .frame = job->next_bake, .life = job->life, .since = clock_->Now()};
+      bake_in_work_ = work;
+      const JobSpec spec = job->stored.spec;
+      lock.unlock();
+      absl::StatusOr<FrameBake> baked = frame_bakery_.Bake(spec, work.frame, *work.stop);
+      lock.lock();
+      bake_in_work_.reset();
+      // Ended or taken up anew meanwhile, or the process ends: then it is baked another time.
+      if (stopping_ || job->life != work.life) continue;
+      FinishBake(*job, work, spec, std::move(baked));
+      DropReleased();
+      changed_.notify_all();
+    }
+  }
+
+  void FinishBake(Job& job, const BakeInWork& work, const JobSpec& spec,
+                  absl::StatusOr<FrameBake> baked) {
+    const JobId& id = job.stored.id;
+    absl::Status status = baked.status();
+    if (status.ok()) {
+      status = store_->SetBaked(id, work.frame, baked->frame, baked->notes, baked->stats);
+    }
+    if (!status.ok()) {
+      FailJob(job, spec.frames.empty() ? status : Annotate(status, FrameName(job, work.frame)));
+      return;
+    }
+    StoredJob& stored = job.stored;
+    stored.frames[work.frame] = baked->frame;
+    for (std::string& note : baked->notes) {
+      if (stored.notes.size() < kMaxStoredNotes &&
+          std::find(stored.notes.begin(), stored.notes.end(), note) == stored.notes.end()) {
+        stored.notes.push_back(std::move(note));
+      }
+    }
+    stored.state = JobState::kRendering;
+    job.begun = true;
+    job.animated = job.animated || baked->animated;
+    ++job.changes;
+    job.ready[work.frame] = true;
+    AdvanceNextBake(job);
+    const auto frame_tiles = static_cast<uint32_t>(job.tiles.size());
+    scheduler_.OpenTiles(id, work.frame * frame_tiles, frame_tiles);
+    const double seconds = std::chrono::duration<double>(clock_->Now() - work.since).count();
+    char took[32];
+    std::snprintf(took, sizeof(took), "%.2f s", seconds);
+    std::string text = spec.frames.empty() ? "" : FrameName(job, work.frame) + ": ";
+    text +=
+        baked->reused ? std::string("an earlier bake is reused") : "baked in " + std::string(took);
+    Log(LogLevel::kInfo, text + ", " + std::to_string(frame_tiles) + " tiles are queued", id);
+    JobLog(job, {.text = text});
+  }
+
+  ExplanationFacts FactsOf(const Job& job) const {
+    ExplanationFacts facts;
+    const JobId& id = job.stored.id;
+    facts.status = StatusOf(job);
+    facts.spec = job.stored.spec;
+    facts.frame_tiles = static_cast<uint32_t>(job.tiles.size());
+    facts.draining = draining_;
+    facts.workers = scheduler_.Workers();
+    facts.report = scheduler_.Report(id);
+    if (IsFinal(job.stored.state)) return facts;
+    facts.paused = job.stored.paused;
+    if (WaitsForOthers(job)) {
+      for (const JobId& other : job.stored.spec.after) {
+        const auto at = jobs_.find(other);
+        if (at == jobs_.end()) {
+          facts.waits_for.push_back({.id = other, .status = std::nullopt});
+        } else if (at->second->stored.state != JobState::kDone) {
+          facts.waits_for.push_back({.id = other, .status = StatusOf(*at->second)});
+        }
+      }
+    }
+    if (bake_in_work_) {
+      facts.baked_first = bake_in_work_->job;
+      if (bake_in_work_->job == id && bake_in_work_->life == job.life) {
+        facts.baking = ExplanationFacts::BakeInWork{
+            .frame_index = bake_in_work_->frame,
+            .seconds = std::chrono::duration<double>(clock_->Now() - bake_in_work_->since).count()};
+      }
+    }
+    const std::vector<std::shared_ptr<Job>> queue = BakeQueue();
+    for (size_t i = 0; i < queue.size(); ++i) {
+      if (queue[i]->stored.id == id) facts.bake_place = i + 1;
+    }
+    if (facts.bake_place > 1) facts.baked_first = queue[facts.bake_place - 2]->stored.id;
+    facts.enough_baked = !job.stored.paused && job.has_frames_to_bake() && EnoughBaked(job);
+    const Job* first = nullptr;
+    for (const auto& [other_id, other] : jobs_) {
+      if (other.get() == &job || other->stored.paused || scheduler_.Leasable(other_id) == 0 ||
+          !GoesBefore(other->stored, job.stored)) {
         continue;
       }
-      next->stored.state = JobState::kBaking;
-      ++next->changes;
-      changed_.notify_all();
-      const JobSpec spec = next->stored.spec;
-      lock.unlock();
-      absl::StatusOr<Baked> baked = BakeOrReuse(spec, next->stop_bake);
-      lock.lock();
-      // Cancelled meanwhile, or the process ends: then the job is baked by the next process.
-      if (stopping_ || next->stored.state != JobState::kBaking) continue;
-      absl::Status status = baked.status();
-      std::vector<StoredTile> committed;
-      if (status.ok()) {
-        status = store_->SetBaked(id, baked->camera, baked->bake.blobs, baked->bake.notes,
-                                  baked->bake.stats);
-      }
-      if (status.ok()) {
-        // There are some if the blobs of a job in work were lost.
-        absl::StatusOr<std::vector<StoredTile>> tiles = store_->Tiles(id);
-        status = tiles.status();
-        if (tiles.ok()) committed = *std::move(tiles);
-      }
-      if (!status.ok()) {
-        FailJob(*next, status);
-      } else {
-        next->stored.camera = baked->camera;
-        next->stored.blobs = baked->bake.blobs;
-        next->stored.notes = baked->bake.notes;
-        next->stored.bake_stats = baked->bake.stats;
-        ++next->changes;
-        StartRendering(*next, committed);
-        Log(CoordinatorLogEntry::Level::kInfo,
-            std::string(baked->reused ? "bake reused, " : "baked, ") +
-                std::to_string(next->tiles.size()) + " tiles are queued",
-            id);
-      }
-      changed_.notify_all();
+      if (first == nullptr || GoesBefore(other->stored, first->stored)) first = other.get();
     }
-  }
-
-  struct Baked {
-    StoredBake bake;
-    Camera camera;
-    bool reused = false;
-  };
-
-  // Without the lock.
-  absl::StatusOr<Baked> BakeOrReuse(const JobSpec& spec, const std::atomic<bool>& stop) {
-    Baked baked;
-    const Digest key = BakeKey(spec);
-    absl::StatusOr<std::optional<StoredBake>> known = store_->FindBake(key);
-    if (!known.ok() && !absl::IsDataLoss(known.status()) &&
-        !absl::IsInvalidArgument(known.status())) {
-      return known.status();
+    if (first != nullptr) {
+      facts.served_first = StatusOf(*first);
+      facts.served_first_tiles = scheduler_.Leasable(first->stored.id);
     }
-    if (known.ok() && known->has_value() && AllReadable((*known)->blobs)) {
-      baked.bake = **std::move(known);
-      baked.reused = true;
-      // The time was spent by the job that baked.
-      baked.bake.stats.seconds = {};
-      baked.bake.stats.wall_seconds = {};
-      baked.bake.stats.skipped["bake"] = 1;
-    } else {
-      AssetBundle asset;
-      asset.root = spec.asset_root;
-      uint64_t total = 0;
-      for (const auto& [uri, digest] : spec.asset_files) {
-        absl::StatusOr<Blob> blob = blobs_->Get(digest);
-        if (!blob.ok()) return Annotate(blob.status(), "asset file '" + uri + "'");
-        total += blob->size();
-        asset.files.emplace(uri, *std::move(blob));
-      }
-      if (total > spec.limits.max_asset_bytes) {
-        return absl::ResourceExhaustedError("the asset has " + std::to_string(total) +
-                                            " bytes, the limit is " +
-                                            std::to_string(spec.limits.max_asset_bytes));
-      }
-      FP_ASSIGN_OR_RETURN(BakeResult result, options_.baker->Bake(asset, spec, stop));
-      FP_ASSIGN_OR_RETURN(baked.bake.blobs.prepared_scene, Keep(result.blobs.prepared_scene));
-      FP_ASSIGN_OR_RETURN(baked.bake.blobs.tree_topology, Keep(result.blobs.tree_topology));
-      FP_ASSIGN_OR_RETURN(baked.bake.blobs.tree_radiance, Keep(result.blobs.tree_radiance));
-      baked.bake.cameras = std::move(result.cameras);
-      baked.bake.made_up_camera = result.made_up_camera;
-      baked.bake.notes = std::move(result.notes);
-      baked.bake.stats = std::move(result.stats);
-      FP_RETURN_IF_ERROR(store_->PutBake(key, baked.bake));
-    }
-    FP_RETURN_IF_ERROR(CheckLimit(baked.bake.stats, "triangles", spec.limits.max_triangles));
-    FP_RETURN_IF_ERROR(CheckLimit(baked.bake.stats, "surfels", spec.limits.max_surfels));
-    Scene cameras;
-    cameras.cameras = baked.bake.cameras;
-    FP_ASSIGN_OR_RETURN(baked.camera, ResolveCamera(spec.camera, cameras));
-    if (baked.bake.made_up_camera && std::holds_alternative<LookAt>(spec.camera)) {
-      std::erase_if(baked.bake.notes,
-                    [](const std::string& note) { return note.starts_with("no camera"); });
-    }
-    return baked;
-  }
-
-  static absl::Status CheckLimit(const Stats& stats, const std::string& what, uint64_t limit) {
-    const auto at = stats.counts.find(what);
-    if (at == stats.counts.end() || at->second <= limit) return absl::OkStatus();
-    return absl::ResourceExhaustedError("the scene has " + std::to_string(at->second) + " " + what +
-                                        ", the limit is " + std::to_string(limit));
-  }
-
-  bool AllReadable(const SceneBlobs& blobs) {
-    for (const Digest& d : {blobs.prepared_scene, blobs.tree_topology, blobs.tree_radiance}) {
-      if (!d.empty() && !blobs_->Get(d).ok()) return false;
-    }
-    return true;
-  }
-
-  absl::StatusOr<Digest> Keep(const Blob& blob) {
-    if (blob.size() == 0) return Digest{};
-    const Digest digest = blob.Hash();
-    FP_RETURN_IF_ERROR(blobs_->Put(digest, blob));
-    return digest;
+    return facts;
   }
 
   // --- Log ---
 
-  void Log(CoordinatorLogEntry::Level level, std::string text, const JobId& job) const {
+  std::string WorkerName(const WorkerId& worker) const {
+    const WorkerHello* const hello = scheduler_.FindWorker(worker);
+    return hello == nullptr || hello->name.empty() ? worker.value : hello->name;
+  }
+
+  // Into the log that belongs to the job.
+  void JobLog(Job& job, LogLine line) {
+    if (line.tile && !job.stored.spec.frames.empty()) {
+      line.text = FrameName(job, job.frame_of(*line.tile)) + ": " + line.text;
+    }
+    const absl::StatusOr<bool> written = store_->AppendLog(job.stored.id, line);
+    if (!written.ok()) {
+      Log(LogLevel::kError, "log not stored: " + written.status().ToString(), job.stored.id);
+    } else if (*written) {
+      ++job.changes;
+    }
+  }
+
+  void Log(LogLevel level, std::string text, const JobId& job) const {
     if (options_.log) options_.log({.level = level, .text = std::move(text), .job = job});
   }
-  void LogWorker(CoordinatorLogEntry::Level level, std::string text, const WorkerId& worker) const {
+  void LogWorker(LogLevel level, std::string text, const WorkerId& worker) const {
     if (options_.log) options_.log({.level = level, .text = std::move(text), .worker = worker});
   }
-  void LogLease(CoordinatorLogEntry::Level level, std::string text, const LeaseGrant& grant) const {
+  void LogLease(LogLevel level, std::string text, const LeaseGrant& grant) const {
     if (!options_.log) return;
     options_.log({.level = level,
                   .text = std::move(text),
@@ -852,13 +1221,17 @@ class CoordinatorImpl final : public Coordinator {
   const std::shared_ptr<const Clock> clock_;
   const std::unique_ptr<BlobStore> blobs_;
   const std::unique_ptr<JobStore> store_;
+  FrameBakery frame_bakery_;
 
+  std::mutex requeue_mutex_;  // before mutex_
   std::mutex mutex_;
   // Something that somebody waits for has happened: work, events, jobs to bake, the end.
   std::condition_variable changed_;
   std::condition_variable stop_ticker_;
   TileScheduler scheduler_;                     // guarded by mutex_
-  std::map<JobId, std::shared_ptr<Job>> jobs_;  // guarded by mutex_, but for stop_bake
+  std::map<JobId, std::shared_ptr<Job>> jobs_;  // guarded by mutex_
+  std::optional<BakeInWork> bake_in_work_;      // guarded by mutex_
+  std::set<Digest> released_;                   // guarded by mutex_
   std::map<JobId, uint64_t> saved_counters_;    // guarded by mutex_
   bool draining_ = false, stopping_ = false;    // guarded by mutex_
   std::thread ticker_, bakery_;

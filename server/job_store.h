@@ -3,7 +3,8 @@
 // changes something returns when it is durable, and changes all or nothing, so that the process may
 // be killed at any instant.
 //
-// Leases are not stored: a tile without a row is queued when the store is opened again.
+// Leases are not stored: a tile without a row is queued when the store is opened again. A store of
+// an older version is brought up to date when it is opened.
 // Errors: kUnavailable (disk full, I/O), kDataLoss (damaged), kFailedPrecondition (in use by
 // another process, written by a newer version); all name the file. Thread-safe.
 #pragma once
@@ -12,6 +13,7 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -29,22 +31,27 @@ struct StoredBake {
   SceneBlobs blobs;
   std::vector<Camera> cameras;
   bool made_up_camera = false;
+  bool animated = false;  // it holds at one time only
   std::vector<std::string> notes;
   Stats stats;
+};
+
+// A frame whose bake has ended.
+struct StoredFrame {
+  Camera camera;
+  SceneBlobs blobs;
 };
 
 struct StoredJob {
   JobId id;
   uint64_t number = 0;  // order of submission
   JobSpec spec;
-  JobState state = JobState::kQueued;
+  JobState state = JobState::kQueued;  // never kPaused: that is a flag beside it
+  bool paused = false;
   absl::Status error;
   int64_t submitted_unix_ms = 0;
-  // From the bake on.
-  std::optional<Camera> camera;
-  SceneBlobs blobs;
-  std::vector<std::string> notes;
-  Stats bake_stats;
+  std::map<uint32_t, StoredFrame> frames;  // by index, those that are baked
+  std::vector<std::string> notes;          // of all bakes, each once
   // From the first committed tile on.
   Digest fingerprint;
   uint64_t reissued = 0, refused_results = 0;
@@ -56,9 +63,16 @@ struct StoredTile {
   uint64_t size_bytes = 0;
 };
 
+// Thread-seconds that a committed tile took, all stages together.
+struct TileSeconds {
+  uint32_t tile = 0;
+  double seconds = 0;
+};
+
 struct StoredEvent {
   uint64_t sequence = 0;
   JobEventBody body;
+  int64_t unix_ms = 0;  // 0: written before events had a time
 };
 
 class JobStore {
@@ -71,14 +85,25 @@ class JobStore {
   // --- Jobs ---
   // All, in the order of submission. A job whose description this version refuses comes as failed.
   virtual absl::StatusOr<std::vector<StoredJob>> LoadJobs() = 0;
-  // Inserts a queued job and its first event; sets job.number. kAlreadyExists: id or submission.
+  // Inserts a queued job and its first event, or two if it starts paused; sets job.number, state
+  // and paused. kAlreadyExists: id or submission.
   virtual absl::Status InsertJob(StoredJob& job, const std::string& submission_id) = 0;
   virtual absl::StatusOr<std::optional<JobId>> FindSubmission(const std::string& id) = 0;
   // With its event. A final state is never left: kFailedPrecondition.
   virtual absl::Status SetState(const JobId& job, JobState state, const absl::Status& error) = 0;
-  // The job goes on to kRendering; its notes become events.
-  virtual absl::Status SetBaked(const JobId& job, const Camera& camera, const SceneBlobs& blobs,
+  // Frame `index` is baked, or baked again. The job goes on to kRendering if it was not there yet;
+  // notes that it did not have yet become events, up to kMaxStoredNotes.
+  virtual absl::Status SetBaked(const JobId& job, uint32_t index, const StoredFrame& frame,
                                 const std::vector<std::string>& notes, const Stats& stats) = 0;
+  // Of the bakes of all frames, added in their order.
+  virtual absl::StatusOr<Stats> BakeStats(const JobId& job) = 0;
+  // With its event: kPaused, or the real state. kFailedPrecondition if the job has ended.
+  virtual absl::Status SetPaused(const JobId& job, bool paused) = 0;
+  virtual absl::Status SetPriority(const JobId& job, int32_t priority) = 0;
+  // A job that has ended is kRendering again if a frame was baked, else kQueued, not paused and
+  // without error; with its event. `all`: its committed tiles are dropped, also those of a job that
+  // has not ended, whose state stays.
+  virtual absl::Status Requeue(const JobId& job, bool all) = 0;
   virtual absl::Status SaveCounters(const JobId& job, uint64_t reissued, uint64_t refused) = 0;
 
   // --- Tiles ---
@@ -93,18 +118,33 @@ class JobStore {
   virtual absl::StatusOr<TileData> ReadTile(const JobId& job, uint32_t tile) = 0;
   // Drops the tiles of an unfinished job whose bytes are missing or damaged; returns which.
   virtual absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(const JobId& job) = 0;
+  // It is as if they had never been committed.
+  virtual absl::Status DropTiles(const JobId& job, const std::vector<uint32_t>& tiles) = 0;
+  // The `count` committed tiles that took the longest, the longest first.
+  virtual absl::StatusOr<std::vector<TileSeconds>> SlowestTiles(const JobId& job, size_t count) = 0;
 
   // --- Events ---
   virtual absl::StatusOr<std::vector<StoredEvent>> Events(const JobId& job, uint64_t after,
                                                           uint32_t max) = 0;
+
+  // Adds an event. False if the job has its kMaxLogLines already: then it is dropped; the first one
+  // that is dropped leaves a line that says so.
+  virtual absl::StatusOr<bool> AppendLog(const JobId& job, const LogLine& line) = 0;
+  // The last lines of at least `level`, at most `max`, in order.
+  virtual absl::StatusOr<std::vector<StoredEvent>> LastLogLines(const JobId& job, LogLevel level,
+                                                                uint32_t max) = 0;
 
   // --- Bakes ---
   virtual absl::StatusOr<std::optional<StoredBake>> FindBake(const Digest& key) = 0;
   virtual absl::Status PutBake(const Digest& key, const StoredBake& bake) = 0;
   virtual absl::Status RemoveBake(const Digest& key) = 0;
 
-  // Jobs that ended before `unix_ms`, with their tiles and events. Returns which.
-  virtual absl::StatusOr<std::vector<JobId>> Purge(int64_t unix_ms) = 0;
+  // Removes the jobs that ended before `unix_ms`, except `keep`, with their tiles and events.
+  // Returns which.
+  virtual absl::StatusOr<std::vector<JobId>> Purge(int64_t unix_ms,
+                                                   const std::set<JobId>& keep) = 0;
 };
+
+inline constexpr size_t kMaxStoredNotes = 1000;
 
 }  // namespace farpoint

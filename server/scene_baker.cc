@@ -1,5 +1,7 @@
 #include "server/scene_baker.h"
 
+#include <bit>
+
 #include "core/base/clock.h"
 #include "core/base/executor.h"
 #include "core/scene/importer.h"
@@ -19,11 +21,13 @@ class CoreBaker final : public SceneBaker {
   explicit CoreBaker(unsigned threads) : executor_(threads) {}
 
   absl::StatusOr<BakeResult> Bake(const AssetBundle& asset, const JobSpec& spec,
+                                  std::optional<double> time_s,
                                   const std::atomic<bool>& cancel) override {
     BakeResult result;
     ImportOptions options;
     options.light_units = spec.light_units;
     options.max_triangles = spec.limits.max_triangles;
+    options.time_s = time_s;
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
 
     const SteadyClock clock;
@@ -44,6 +48,7 @@ class CoreBaker final : public SceneBaker {
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
     result.cameras = std::move(imported.scene.cameras);
     result.notes = std::move(imported.notes);
+    result.animated = imported.animation.has_value();
     return result;
   }
 
@@ -91,6 +96,14 @@ Digest BakeKey(const JobSpec& spec) {
   HashPart(hash, FARPOINT_VERSION);
   // No maps and no unknown fields: the serialisation of one process and version is canonical.
   HashPart(hash, ToWire(relevant).SerializeAsString());
+  return hash.Finish();
+}
+
+Digest BakeKeyAt(const JobSpec& spec, std::optional<double> time_s) {
+  Sha256 hash;
+  HashPart(hash, BakeKey(spec).Hex());
+  hash.UpdateU64(time_s ? 1 : 0);
+  hash.UpdateU64(time_s ? std::bit_cast<uint64_t>(*time_s) : 0);
   return hash.Finish();
 }
 

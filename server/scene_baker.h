@@ -3,6 +3,7 @@
 
 #include <atomic>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -20,6 +21,7 @@ struct BakeResult {
   std::vector<Camera> cameras;     // of the scene, or one made up: not empty
   bool made_up_camera = false;     // then a note beginning with "no camera" says so
   std::vector<std::string> notes;  // one line each
+  bool animated = false;           // another time may give another scene
   Stats stats;
 };
 
@@ -27,9 +29,11 @@ struct BakeResult {
 class SceneBaker {
  public:
   virtual ~SceneBaker() = default;
-  // `cancel` is looked at between the stages: kCancelled. Limits of `spec` that the scene exceeds
-  // are kResourceExhausted; whatever is wrong with the scene is kInvalidArgument or kNotFound.
+  // The scene at `time_s`; nothing: at rest. `cancel` is looked at between the stages: kCancelled.
+  // Limits of `spec` that the scene exceeds are kResourceExhausted; whatever is wrong with the
+  // scene is kInvalidArgument or kNotFound.
   virtual absl::StatusOr<BakeResult> Bake(const AssetBundle& asset, const JobSpec& spec,
+                                          std::optional<double> time_s,
                                           const std::atomic<bool>& cancel) = 0;
 };
 
@@ -39,6 +43,9 @@ std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads);
 // What decides a bake's blobs and nothing else: the asset's files, overrides, light units, the
 // settings that Bake reads, and this version. Jobs with equal keys share their blobs. Settings that
 // only the tiles need are left out by name, so that a new one counts until it is known to be free.
+// This is the key of a scene that is the same at all times.
 Digest BakeKey(const JobSpec& spec);
+// The key of an animated scene at one time, or at rest.
+Digest BakeKeyAt(const JobSpec& spec, std::optional<double> time_s);
 
 }  // namespace farpoint

@@ -52,11 +52,15 @@ void TileScheduler::AddJob(const ScheduledJob& spec) {
     job.tiles[tile].state = TileState::kCommitted;
   }
   for (uint32_t i = 0; i < spec.tiles; ++i) {
-    if (job.tiles[i].state == TileState::kQueued) job.queued.insert(job.queued.end(), i);
+    job.tiles[i].open = spec.open;
+    if (spec.open && job.tiles[i].state == TileState::kQueued) {
+      job.queued.insert(job.queued.end(), i);
+    }
   }
   job.counts.total = spec.tiles;
   job.counts.committed = static_cast<uint32_t>(spec.committed.size());
-  job.counts.queued = static_cast<uint32_t>(job.queued.size());
+  job.counts.queued = spec.tiles - job.counts.committed;
+  if (spec.paused) job.paused_at = clock_.Now();
   jobs_.emplace(spec.id, std::move(job));
 }
 
@@ -69,6 +73,47 @@ void TileScheduler::RemoveJob(const JobId& id) {
   }
   for (const LeaseId& lease : ending) EndLease(lease);
   jobs_.erase(at);
+}
+
+void TileScheduler::OpenTiles(const JobId& id, uint32_t first, uint32_t count) {
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return;
+  Job& job = at->second;
+  FP_CHECK(first <= job.tiles.size() && count <= job.tiles.size() - first);
+  for (uint32_t tile = first; tile < first + count; ++tile) {
+    job.tiles[tile].open = true;
+    if (job.tiles[tile].state == TileState::kQueued) job.queued.insert(tile);
+  }
+}
+
+void TileScheduler::SetPaused(const JobId& id, bool paused) {
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return;
+  Job& job = at->second;
+  if (paused == job.paused_at.has_value()) return;
+  const TimePoint now = clock_.Now();
+  if (paused) {
+    job.paused_at = now;
+    return;
+  }
+  if (job.started) *job.started += now - std::max(*job.paused_at, *job.started);
+  job.paused_at.reset();
+}
+
+void TileScheduler::SetPriority(const JobId& id, int32_t priority) {
+  const auto at = jobs_.find(id);
+  if (at != jobs_.end()) at->second.spec.priority = priority;
+}
+
+void TileScheduler::ForgetFailures(const JobId& id) {
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return;
+  Job& job = at->second;
+  for (Tile& tile : job.tiles) {
+    tile.failures = 0;
+    tile.dead.clear();
+  }
+  job.causes.clear();
 }
 
 TileCounts TileScheduler::Counts(const JobId& id) const {
@@ -93,7 +138,7 @@ std::optional<double> TileScheduler::EtaSeconds(const JobId& id) const {
   if (at == jobs_.end()) return std::nullopt;
   const Job& job = at->second;
   if (job.counts.committed == job.counts.total) return 0;
-  if (!job.started || job.committed_here == 0) return std::nullopt;
+  if (!job.started || job.committed_here == 0 || job.paused_at) return std::nullopt;
   const double total = job.counts.total;
   const double here = Progress(id) * total - (job.counts.committed - job.committed_here);
   const double elapsed = Seconds(clock_.Now() - *job.started);
@@ -107,6 +152,39 @@ uint64_t TileScheduler::Reissued(const JobId& id) const {
 uint64_t TileScheduler::Refused(const JobId& id) const {
   const auto at = jobs_.find(id);
   return at == jobs_.end() ? 0 : at->second.refused;
+}
+
+uint32_t TileScheduler::Leasable(const JobId& id) const {
+  const auto at = jobs_.find(id);
+  return at == jobs_.end() ? 0 : static_cast<uint32_t>(at->second.queued.size());
+}
+
+JobReport TileScheduler::Report(const JobId& id) const {
+  JobReport report;
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return report;
+  const Job& job = at->second;
+  report.leasable = static_cast<uint32_t>(job.queued.size());
+  report.fingerprint = job.fingerprint;
+  const TimePoint now = clock_.Now();
+  for (const auto& [lease, live] : leases_) {
+    if (live.grant.job != id) continue;
+    report.in_work.push_back({.grant = live.grant,
+                              .worker_name = NameOfWorker(live.grant.worker),
+                              .seconds = Seconds(now - live.started),
+                              .fraction = std::clamp(live.progress.fraction, 0.0f, 1.0f)});
+  }
+  std::stable_sort(report.in_work.begin(), report.in_work.end(),
+                   [](const TileInWork& a, const TileInWork& b) { return a.seconds > b.seconds; });
+  for (const auto& [tile, cause] : job.causes) {
+    const Tile& t = job.tiles[tile];
+    if (t.state == TileState::kCommitted) continue;
+    report.troubled.push_back({.tile = tile,
+                               .failures = t.failures,
+                               .workers = static_cast<uint32_t>(t.dead.size()),
+                               .cause = cause});
+  }
+  return report;
 }
 
 void TileScheduler::SetState(Job& job, uint32_t tile, TileState state) {
@@ -128,7 +206,7 @@ void TileScheduler::SetState(Job& job, uint32_t tile, TileState state) {
   --count(now);
   ++count(state);
   if (now == TileState::kQueued) job.queued.erase(tile);
-  if (state == TileState::kQueued) job.queued.insert(tile);
+  if (state == TileState::kQueued && job.tiles[tile].open) job.queued.insert(tile);
   now = state;
 }
 
@@ -177,6 +255,16 @@ std::vector<WorkerStatus> TileScheduler::Workers() const {
     all.push_back(std::move(status));
   }
   return all;
+}
+
+const WorkerHello* TileScheduler::FindWorker(const WorkerId& id) const {
+  const auto at = workers_.find(id);
+  return at == workers_.end() ? nullptr : &at->second.hello;
+}
+
+std::string TileScheduler::NameOfWorker(const WorkerId& id) const {
+  const WorkerHello* const hello = FindWorker(id);
+  return hello == nullptr || hello->name.empty() ? id.value : hello->name;
 }
 
 bool TileScheduler::IsSetAside(const Worker& worker) const {
@@ -234,6 +322,7 @@ std::optional<LeaseGrant> TileScheduler::Lease(const WorkerId& id) {
 
   std::vector<Job*> jobs;
   for (auto& [job_id, job] : jobs_) {
+    if (job.paused_at) continue;
     if (job.fingerprint.empty() || job.fingerprint == worker.hello.fingerprint) {
       jobs.push_back(&job);
     }
@@ -383,6 +472,12 @@ std::optional<LeaseGrant> TileScheduler::FindLease(const LeaseId& lease) const {
   return at->second.grant;
 }
 
+JobId TileScheduler::JobOf(const LeaseId& lease) const {
+  if (const auto at = leases_.find(lease); at != leases_.end()) return at->second.grant.job;
+  const auto ended = ended_.find(lease);
+  return ended == ended_.end() ? JobId{} : ended->second;
+}
+
 void TileScheduler::EndLease(const LeaseId& lease) {
   const auto at = leases_.find(lease);
   if (at == leases_.end()) return;
@@ -411,39 +506,46 @@ void TileScheduler::EndLease(const LeaseId& lease) {
   ended_[lease] = grant.job;
 }
 
-void TileScheduler::FailJob(Job& job, absl::Status error, SchedulerNews& news) {
+void TileScheduler::FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile,
+                            SchedulerNews& news) {
   std::vector<LeaseId> ending;
   for (const auto& [lease, live] : leases_) {
     if (live.grant.job == job.spec.id) ending.push_back(lease);
   }
   for (const LeaseId& lease : ending) EndLease(lease);
-  while (!job.queued.empty()) SetState(job, *job.queued.begin(), TileState::kFailed);
-  news.failed.push_back({job.spec.id, std::move(error)});
+  for (uint32_t i = 0; i < job.tiles.size(); ++i) {
+    if (job.tiles[i].state == TileState::kQueued) SetState(job, i, TileState::kFailed);
+  }
+  news.failed.push_back({job.spec.id, std::move(error), tile});
 }
 
 void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, SchedulerNews& news) {
+  LostLease lost{.grant = grant, .reason = cause, .worker_name = NameOfWorker(grant.worker)};
   if (const auto at = workers_.find(grant.worker); at != workers_.end()) {
     Worker& worker = at->second;
     ++worker.failures;
     if (++worker.failures_in_a_row >= options_.max_worker_failures) {
       worker.set_aside_until = clock_.Now() + options_.set_aside_time;
+      lost.worker_set_aside = true;
     }
   }
+  news.lost.push_back(std::move(lost));
   Job& job = jobs_.at(grant.job);
   Tile& tile = job.tiles[grant.tile];
   ++job.reissued;
   if (tile.state == TileState::kCommitted || tile.state == TileState::kFailed) return;
   ++tile.failures;
   tile.dead.insert(grant.worker);
+  job.causes[grant.tile] = cause;
   if (tile.dead.size() < options_.max_dead_workers && tile.failures < options_.max_tile_failures) {
     return;
   }
   FailJob(job,
-          absl::AbortedError(
-              "tile " + std::to_string(grant.tile) + " failed " + std::to_string(tile.failures) +
-              " times on " + std::to_string(tile.dead.size()) +
-              " workers; the last cause: " + cause + "; see the workers' logs, then submit again"),
-          news);
+          absl::AbortedError("tile " + std::to_string(grant.tile) + " failed " +
+                             std::to_string(tile.failures) + " times on " +
+                             std::to_string(tile.dead.size()) + " workers; the last cause: " +
+                             cause + "; see the workers' logs, then requeue the job"),
+          grant.tile, news);
 }
 
 SchedulerNews TileScheduler::RefuseResult(const LeaseId& lease, const std::string& reason) {
@@ -454,7 +556,6 @@ SchedulerNews TileScheduler::RefuseResult(const LeaseId& lease, const std::strin
   ++jobs_.at(grant.job).refused;
   EndLease(lease);
   ForgetUnusedFingerprint(jobs_.at(grant.job));
-  news.lost.push_back({grant, reason});
   Blame(grant, reason, news);
   return news;
 }
@@ -475,10 +576,10 @@ SchedulerNews TileScheduler::ReportFailure(const WorkerId& worker, const LeaseId
   }
   const std::string cause(error.message());
   if (IsPermanent(error.code())) {
-    FailJob(jobs_.at(grant.job), Annotate(error, "tile " + std::to_string(grant.tile)), news);
+    FailJob(jobs_.at(grant.job), Annotate(error, "tile " + std::to_string(grant.tile)), grant.tile,
+            news);
     return news;
   }
-  news.lost.push_back({grant, cause});
   Blame(grant, cause, news);
   return news;
 }
@@ -510,17 +611,16 @@ SchedulerNews TileScheduler::Tick() {
     // A job that failed a moment ago took its leases with it.
     if (!leases_.contains(grant.lease)) continue;
     EndLease(grant.lease);
-    news.lost.push_back({grant, reason});
     Blame(grant, reason, news);
   }
   for (auto& [id, job] : jobs_) {
-    if (!job.started || job.counts.queued + job.counts.leased == 0) continue;
+    if (!job.started || job.paused_at || job.counts.queued + job.counts.leased == 0) continue;
     if (job.spec.max_time != Duration::max() && now - *job.started > job.spec.max_time) {
       FailJob(job,
               absl::DeadlineExceededError("the job rendered longer than its limit of " +
                                           SecondsText(job.spec.max_time) +
                                           "; raise limits.max_seconds or render less"),
-              news);
+              std::nullopt, news);
     }
   }
   for (const auto& [id, worker] : workers_) {

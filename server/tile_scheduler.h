@@ -7,6 +7,7 @@
 //   - its worker reports failure, gives it back or leaves,
 //   - nothing was heard of its worker for silence_time, or progress stood still for lease_time,
 //   - its job ends, or its job commits a tile of another fingerprint.
+// A queued tile is leased only when it is open (its frame is baked) and its job is not paused.
 // Committing takes two steps, since a result counts when it is durable: BeginCommit pins the lease,
 // FinishCommit ends it. In between the tile counts as leased and no other result is taken.
 #pragma once
@@ -48,6 +49,8 @@ struct ScheduledJob {
   Digest fingerprint;                   // of the committed tiles; empty if there are none
   Duration max_time = Duration::max();  // from the first lease on
   Duration lease_time{};                // if longer than the options' one
+  bool open = true;                     // false: no tile may be leased until OpenTiles names it
+  bool paused = false;
 };
 
 struct LeaseGrant {
@@ -63,15 +66,38 @@ struct LeaseGrant {
 struct LostLease {
   LeaseGrant grant;
   std::string reason;
+  std::string worker_name;
+  bool worker_set_aside = false;  // by this
 };
 struct FailedJob {
   JobId job;
-  absl::Status error;  // names tile and cause
+  absl::Status error;            // names tile and cause
+  std::optional<uint32_t> tile;  // that the job failed by
 };
 struct SchedulerNews {
   std::vector<LostLease> lost;
   std::vector<FailedJob> failed;    // their tiles are failed, their leases gone
   std::vector<WorkerId> forgotten;  // were silent too long
+};
+
+// How the tiles of a job get on, for people.
+struct TileInWork {
+  LeaseGrant grant;
+  std::string worker_name;
+  double seconds = 0;  // since it was leased
+  float fraction = 0;  // [0, 1]
+};
+struct TroubledTile {
+  uint32_t tile = 0;
+  uint32_t failures = 0;
+  uint32_t workers = 0;  // different ones that it failed on
+  std::string cause;     // the last one
+};
+struct JobReport {
+  uint32_t leasable = 0;               // queued and open tiles
+  Digest fingerprint;                  // empty: any worker may take it
+  std::vector<TileInWork> in_work;     // the longest first
+  std::vector<TroubledTile> troubled;  // not committed, failed at least once; by tile
 };
 
 class TileScheduler {
@@ -84,12 +110,21 @@ class TileScheduler {
   // Its leases are gone; their workers hear it at the next Renew. Unknown ids are ignored.
   void RemoveJob(const JobId& job);
   bool HasJob(const JobId& job) const { return jobs_.contains(job); }
+  // Tiles [first, first + count) of a job may be leased from now on; those that are open stay so.
+  void OpenTiles(const JobId& job, uint32_t first, uint32_t count);
+  // The time of a pause counts neither for max_time nor for the estimated rest.
+  void SetPaused(const JobId& job, bool paused);
+  void SetPriority(const JobId& job, int32_t priority);
+  // Its tiles count as if they had never failed, on any worker.
+  void ForgetFailures(const JobId& job);
   // Zeros for an unknown job, as the next ones.
   TileCounts Counts(const JobId& job) const;
   double Progress(const JobId& job) const;
   std::optional<double> EtaSeconds(const JobId& job) const;
   uint64_t Reissued(const JobId& job) const;
   uint64_t Refused(const JobId& job) const;
+  uint32_t Leasable(const JobId& job) const;  // queued and open tiles
+  JobReport Report(const JobId& job) const;
 
   // --- Workers ---
   void AddWorker(const WorkerId& id, const WorkerHello& hello);
@@ -99,6 +134,9 @@ class TileScheduler {
   // Its leases are queued again, without blame.
   void RemoveWorker(const WorkerId& id);
   std::vector<WorkerStatus> Workers() const;
+  size_t worker_count() const { return workers_.size(); }
+  // What it said of itself; null for an unknown one. Valid until workers are added or removed.
+  const WorkerHello* FindWorker(const WorkerId& id) const;
   uint32_t ActiveLeases() const { return static_cast<uint32_t>(leases_.size()); }
 
   // --- Leases ---
@@ -120,6 +158,8 @@ class TileScheduler {
   SchedulerNews ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                               const absl::Status& error);
   std::optional<LeaseGrant> FindLease(const LeaseId& lease) const;
+  // Also of leases that ended lately; empty if it is not known.
+  JobId JobOf(const LeaseId& lease) const;
 
   // The caller itself stood still for `gap` (its machine slept, its process was stopped) and could
   // not hear anybody: that time counts against no lease and no worker.
@@ -131,6 +171,7 @@ class TileScheduler {
   enum class TileState : uint8_t { kQueued, kLeased, kCommitted, kFailed };
   struct Tile {
     TileState state = TileState::kQueued;
+    bool open = true;
     uint32_t attempts = 0;
     uint32_t failures = 0;
     std::set<WorkerId> dead;      // workers that it took down or that failed on it
@@ -139,12 +180,14 @@ class TileScheduler {
   struct Job {
     ScheduledJob spec;
     std::vector<Tile> tiles;
-    std::set<uint32_t> queued;  // tiles in state kQueued, in order
+    std::set<uint32_t> queued;  // open tiles in state kQueued, in order
     TileCounts counts;
     Digest fingerprint;
     std::optional<TimePoint> started;  // first lease
     uint32_t committed_here = 0;       // since it was added
     std::vector<Duration> durations;   // of the last committed tiles
+    std::optional<TimePoint> paused_at;
+    std::map<uint32_t, std::string> causes;  // of the last failure of tiles
     uint64_t reissued = 0, refused = 0;
   };
   struct Worker {
@@ -167,11 +210,12 @@ class TileScheduler {
   LeaseGrant Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative);
   // Takes the lease away from worker and tile; a tile without leases is queued again.
   void EndLease(const LeaseId& lease);
-  // Blames worker and tile for the loss of `lease`; the job may fail by it.
+  std::string NameOfWorker(const WorkerId& id) const;
+  // Blames worker and tile for the loss of a lease, and tells of it; the job may fail by it.
   void Blame(const LeaseGrant& grant, const std::string& cause, SchedulerNews& news);
   // After a first result that did not become durable.
   void ForgetUnusedFingerprint(Job& job);
-  void FailJob(Job& job, absl::Status error, SchedulerNews& news);
+  void FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile, SchedulerNews& news);
   void SetState(Job& job, uint32_t tile, TileState state);
 
   const SchedulerOptions options_;

@@ -114,7 +114,8 @@ TEST_F(CoordinatorTest, AJobGoesFromSubmissionToImage) {
   EXPECT_EQ(info->stats.counts.at("receivers"), 64u * 32u);
   EXPECT_EQ(info->stats.counts.at("triangles"), 12u);
   EXPECT_EQ(info->notes.size(), 2u);
-  EXPECT_NE(info->camera.world_to_ndc[0], 0);
+  ASSERT_EQ(info->frames.size(), 1u);
+  EXPECT_NE(info->frames[0].camera.world_to_ndc[0], 0);
   for (uint32_t i = 0; i < 2; ++i) {
     const auto tile = coordinator_->FetchTile(job, i);
     ASSERT_TRUE(tile.ok()) << tile.status();
@@ -255,7 +256,7 @@ TEST_F(CoordinatorTest, CancelEndsBakesAndLeases) {
   EXPECT_FALSE(coordinator_->Return(worker, Render(work))->accepted);
   EXPECT_EQ(WaitForEnd(rendering), JobState::kCancelled);
   EXPECT_TRUE(coordinator_->Cancel(rendering).ok());  // once more is harmless
-  EXPECT_EQ(coordinator_->Status(rendering)->tiles, (TileCounts{.failed = 2, .total = 2}));
+  EXPECT_EQ(coordinator_->Status(rendering)->tiles, (TileCounts{.queued = 2, .total = 2}));
 }
 
 TEST_F(CoordinatorTest, ALostWorkersTileIsLeasedAgain) {

@@ -19,6 +19,7 @@ namespace farpoint {
 class FakeBaker final : public SceneBaker {
  public:
   absl::StatusOr<BakeResult> Bake(const AssetBundle& asset, const JobSpec& spec,
+                                  std::optional<double> time_s,
                                   const std::atomic<bool>& cancel) override {
     ++bakes;
     while (hold.load()) {

@@ -11,6 +11,8 @@
 #include <fstream>
 
 #include "core/image/film.h"
+#include "proto/convert.h"
+#include "proto/records.pb.h"
 #include "tests/unit/server/temp_folder.h"
 
 namespace farpoint {
@@ -41,6 +43,10 @@ TileResult ResultOf(const std::string& bytes) {
   return result;
 }
 
+StoredFrame SomeFrame(const std::string& scene = "s") {
+  return {.camera = {}, .blobs = {DigestOf(scene), {}, {}}};
+}
+
 std::unique_ptr<JobStore> OpenOrDie(const std::string& folder) {
   absl::StatusOr<std::unique_ptr<JobStore>> store = JobStore::Open(folder);
   EXPECT_TRUE(store.ok()) << store.status();
@@ -67,8 +73,8 @@ TEST_P(JobStoreTest, KeepsJobs) {
   ASSERT_TRUE(store_->SetState(a.id, JobState::kBaking, absl::OkStatus()).ok());
   Stats stats;
   stats.counts["surfels"] = 5;
-  ASSERT_TRUE(
-      store_->SetBaked(a.id, camera, {DigestOf("s"), DigestOf("t"), {}}, {"n1", "n2"}, stats).ok());
+  const StoredFrame frame{.camera = camera, .blobs = {DigestOf("s"), DigestOf("t"), {}}};
+  ASSERT_TRUE(store_->SetBaked(a.id, 0, frame, {"n1", "n2"}, stats).ok());
   ASSERT_TRUE(store_->SaveCounters(a.id, 7, 8).ok());
   ASSERT_TRUE(store_->SetState(b.id, JobState::kFailed, absl::NotFoundError("gone")).ok());
 
@@ -79,11 +85,12 @@ TEST_P(JobStoreTest, KeepsJobs) {
   EXPECT_EQ(x.id, a.id);
   EXPECT_EQ(x.state, JobState::kRendering);
   EXPECT_EQ(x.spec.title, "title of aaaaaaaa");
-  EXPECT_EQ(x.camera->eye, camera.eye);
-  EXPECT_EQ(x.blobs.tree_topology, DigestOf("t"));
-  EXPECT_TRUE(x.blobs.tree_radiance.empty());
+  ASSERT_EQ(x.frames.size(), 1u);
+  EXPECT_EQ(x.frames.at(0).camera.eye, camera.eye);
+  EXPECT_EQ(x.frames.at(0).blobs.tree_topology, DigestOf("t"));
+  EXPECT_TRUE(x.frames.at(0).blobs.tree_radiance.empty());
   EXPECT_EQ(x.notes, (std::vector<std::string>{"n1", "n2"}));
-  EXPECT_EQ(x.bake_stats.counts.at("surfels"), 5u);
+  EXPECT_EQ(store_->BakeStats(a.id)->counts.at("surfels"), 5u);
   EXPECT_EQ(x.reissued, 7u);
   EXPECT_EQ(x.refused_results, 8u);
   EXPECT_EQ((*jobs)[1].state, JobState::kFailed);
@@ -132,7 +139,7 @@ TEST_P(JobStoreTest, EventsAreNumberedWithoutGaps) {
   StoredJob a = NewJob("aaaaaaaa"), b = NewJob("bbbbbbbb");
   ASSERT_TRUE(store_->InsertJob(a, "").ok());
   ASSERT_TRUE(store_->InsertJob(b, "").ok());
-  ASSERT_TRUE(store_->SetBaked(a.id, {}, {DigestOf("s"), {}, {}}, {"note"}, {}).ok());
+  ASSERT_TRUE(store_->SetBaked(a.id, 0, SomeFrame(), {"note"}, {}).ok());
   ASSERT_TRUE(store_->CommitTile(a.id, 9, ResultOf("x"), DigestOf("f")).ok());
   ASSERT_TRUE(store_->SetState(a.id, JobState::kDone, absl::OkStatus()).ok());
   const auto events = store_->Events(a.id, 0, 100);
@@ -177,12 +184,226 @@ TEST_P(JobStoreTest, PurgeTakesEndedJobsOnly) {
   ASSERT_TRUE(store_->InsertJob(b, "").ok());
   ASSERT_TRUE(store_->CommitTile(a.id, 0, ResultOf("x"), DigestOf("f")).ok());
   ASSERT_TRUE(store_->SetState(a.id, JobState::kDone, absl::OkStatus()).ok());
-  EXPECT_THAT(*store_->Purge(1000), IsEmpty());
-  EXPECT_EQ(store_->Purge(INT64_MAX)->size(), 1u);
+  EXPECT_THAT(*store_->Purge(1000, {}), IsEmpty());
+  EXPECT_THAT(*store_->Purge(INT64_MAX, {a.id}), IsEmpty());
+  EXPECT_EQ(store_->Purge(INT64_MAX, {})->size(), 1u);
   EXPECT_EQ(store_->LoadJobs()->size(), 1u);
   EXPECT_TRUE(absl::IsNotFound(store_->ReadTile(a.id, 0).status()));
   EXPECT_THAT(*store_->Events(a.id, 0, 10), IsEmpty());
   EXPECT_FALSE(fs::exists(folder_ / "tiles/aaaaaaaa"));
+}
+
+TEST_P(JobStoreTest, KeepsTheFramesOfAnAnimation) {
+  StoredJob a = NewJob("aaaaaaaa");
+  a.spec.frames = {5, 3, 9};
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  Stats stats;
+  stats.counts["surfels"] = 5;
+  ASSERT_TRUE(store_->SetBaked(a.id, 2, SomeFrame("two"), {"n1"}, stats).ok());
+  ASSERT_TRUE(store_->SetBaked(a.id, 0, SomeFrame("zero"), {"n1", "n2"}, stats).ok());
+  ASSERT_TRUE(store_->SetBaked(a.id, 2, SomeFrame("again"), {"n2"}, stats).ok());
+  const StoredJob x = (*store_->LoadJobs())[0];
+  ASSERT_EQ(x.frames.size(), 2u);
+  EXPECT_EQ(x.frames.at(0).blobs.prepared_scene, DigestOf("zero"));
+  EXPECT_EQ(x.frames.at(2).blobs.prepared_scene, DigestOf("again"));
+  EXPECT_EQ(x.notes, (std::vector<std::string>{"n1", "n2"}));
+  EXPECT_EQ(store_->BakeStats(a.id)->counts.at("surfels"), 10u);
+  // Queued, n1, rendering, n2: neither a note nor the state is told twice.
+  EXPECT_EQ(store_->Events(a.id, 0, 100)->size(), 4u);
+  ASSERT_TRUE(store_->SetState(a.id, JobState::kCancelled, absl::OkStatus()).ok());
+  EXPECT_TRUE(absl::IsFailedPrecondition(store_->SetBaked(a.id, 1, SomeFrame(), {}, {})));
+}
+
+TEST_P(JobStoreTest, PausesAndPrioritiesAreKeptBesideTheState) {
+  StoredJob a = NewJob("aaaaaaaa"), b = NewJob("bbbbbbbb");
+  b.spec.start_paused = true;
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  ASSERT_TRUE(store_->InsertJob(b, "").ok());
+  EXPECT_TRUE(b.paused);
+  ASSERT_TRUE(store_->SetState(a.id, JobState::kBaking, absl::OkStatus()).ok());
+  ASSERT_TRUE(store_->SetPaused(a.id, true).ok());
+  ASSERT_TRUE(store_->SetPriority(a.id, -7).ok());
+  const auto jobs = store_->LoadJobs();
+  EXPECT_EQ((*jobs)[0].state, JobState::kBaking);
+  EXPECT_TRUE((*jobs)[0].paused);
+  EXPECT_EQ((*jobs)[0].spec.priority, -7);
+  EXPECT_EQ((*jobs)[0].spec.title, a.spec.title);
+  EXPECT_TRUE((*jobs)[1].paused);
+  ASSERT_TRUE(store_->SetPaused(a.id, false).ok());
+  EXPECT_FALSE((*store_->LoadJobs())[0].paused);
+  const auto events = store_->Events(a.id, 0, 100);
+  ASSERT_EQ(events->size(), 4u);
+  EXPECT_EQ(std::get<JobState>((*events)[2].body), JobState::kPaused);
+  EXPECT_EQ(std::get<JobState>((*events)[3].body), JobState::kBaking);
+  EXPECT_GT((*events)[3].unix_ms, 1'600'000'000'000);
+  EXPECT_GE((*events)[3].unix_ms, (*events)[0].unix_ms);
+  EXPECT_TRUE(absl::IsNotFound(store_->SetPaused({"unknown"}, true)));
+  EXPECT_TRUE(absl::IsNotFound(store_->SetPriority({"unknown"}, 1)));
+  ASSERT_TRUE(store_->SetState(a.id, JobState::kFailed, absl::AbortedError("x")).ok());
+  EXPECT_TRUE(absl::IsFailedPrecondition(store_->SetPaused(a.id, true)));
+}
+
+TEST_P(JobStoreTest, RequeueGoesOnOrStartsAnew) {
+  StoredJob a = NewJob("aaaaaaaa"), b = NewJob("bbbbbbbb");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  ASSERT_TRUE(store_->InsertJob(b, "").ok());
+  ASSERT_TRUE(store_->SetBaked(a.id, 0, SomeFrame(), {}, {}).ok());
+  ASSERT_TRUE(store_->CommitTile(a.id, 1, ResultOf("x"), DigestOf("f")).ok());
+  ASSERT_TRUE(store_->SetPaused(a.id, true).ok());
+  ASSERT_TRUE(store_->SetState(a.id, JobState::kFailed, absl::AbortedError("tile 0")).ok());
+  ASSERT_TRUE(store_->SetState(b.id, JobState::kCancelled, absl::OkStatus()).ok());
+
+  ASSERT_TRUE(store_->Requeue(a.id, false).ok());
+  ASSERT_TRUE(store_->Requeue(b.id, false).ok());
+  auto jobs = store_->LoadJobs();
+  EXPECT_EQ((*jobs)[0].state, JobState::kRendering);
+  EXPECT_TRUE((*jobs)[0].error.ok());
+  EXPECT_FALSE((*jobs)[0].paused);
+  EXPECT_EQ((*jobs)[0].fingerprint, DigestOf("f"));
+  EXPECT_EQ((*jobs)[1].state, JobState::kQueued);
+  EXPECT_EQ(store_->Tiles(a.id)->size(), 1u);
+  EXPECT_THAT(*store_->Purge(INT64_MAX, {}), IsEmpty());  // it has not ended any more
+  const auto last = store_->Events(a.id, 0, 100)->back();
+  EXPECT_EQ(std::get<JobState>(last.body), JobState::kRendering);
+
+  ASSERT_TRUE(store_->Requeue(a.id, true).ok());
+  EXPECT_THAT(*store_->Tiles(a.id), IsEmpty());
+  EXPECT_TRUE((*store_->LoadJobs())[0].fingerprint.empty());
+  EXPECT_EQ(store_->Events(a.id, 0, 100)->back().sequence, last.sequence);  // still rendering
+  EXPECT_TRUE(store_->CommitTile(a.id, 1, ResultOf("y"), DigestOf("g")).ok());
+  EXPECT_TRUE(store_->ReadTile(a.id, 1).ok());
+  EXPECT_TRUE(absl::IsNotFound(store_->Requeue({"unknown"}, true)));
+}
+
+TEST_P(JobStoreTest, KeepsSoManyLinesOfLogAndSaysSo) {
+  StoredJob a = NewJob("aaaaaaaa");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  const LogLine line{
+      .level = LogLevel::kWarning, .text = "lease lost", .tile = 3, .attempt = 2, .worker = "w"};
+  ASSERT_TRUE(*store_->AppendLog(a.id, line));
+  ASSERT_TRUE(*store_->AppendLog(a.id, {.text = "fine"}));
+  EXPECT_EQ(std::get<LogLine>(store_->Events(a.id, 1, 1)->front().body), line);
+  EXPECT_EQ(store_->LastLogLines(a.id, LogLevel::kInfo, 10)->size(), 2u);
+  const auto warnings = store_->LastLogLines(a.id, LogLevel::kWarning, 10);
+  ASSERT_EQ(warnings->size(), 1u);
+  EXPECT_EQ(std::get<LogLine>((*warnings)[0].body), line);
+  if (!GetParam()) return;  // each line is flushed: on a disk the rest takes long
+  for (uint32_t i = 2; i < kMaxLogLines; ++i) ASSERT_TRUE(*store_->AppendLog(a.id, line));
+  EXPECT_TRUE(*store_->AppendLog(a.id, line));
+  EXPECT_FALSE(*store_->AppendLog(a.id, line));
+  const auto lines = store_->LastLogLines(a.id, LogLevel::kInfo, 2 * kMaxLogLines);
+  ASSERT_EQ(lines->size(), kMaxLogLines + 1);
+  EXPECT_THAT(std::get<LogLine>(lines->back().body).text, HasSubstr("more than 10000 lines"));
+}
+
+TEST_P(JobStoreTest, FindsTheSlowestTiles) {
+  StoredJob a = NewJob("aaaaaaaa");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  for (uint32_t i = 0; i < 4; ++i) {
+    TileResult result = ResultOf("x");
+    result.stats.seconds[static_cast<size_t>(Stage::kCut)] = i == 1 ? 9 : i;
+    result.stats.seconds[static_cast<size_t>(Stage::kPrimary)] = 1;
+    ASSERT_TRUE(store_->CommitTile(a.id, i, result, DigestOf("f")).ok());
+  }
+  const auto slowest = store_->SlowestTiles(a.id, 2);
+  ASSERT_EQ(slowest->size(), 2u);
+  EXPECT_EQ((*slowest)[0].tile, 1u);
+  EXPECT_EQ((*slowest)[0].seconds, 10);
+  EXPECT_EQ((*slowest)[1].tile, 3u);
+  ASSERT_TRUE(store_->DropTiles(a.id, {1}).ok());
+  EXPECT_EQ(store_->SlowestTiles(a.id, 1)->front().tile, 3u);
+  EXPECT_TRUE(absl::IsNotFound(store_->ReadTile(a.id, 1).status()));
+}
+
+// What version 1 wrote: a job was one frame, and its bake stood in its row.
+TEST(JobStore, AStoreOfVersionOneIsBroughtUpToDate) {
+  TempFolder folder;
+  v1::Notes notes;
+  notes.add_lines("a note");
+  Stats stats;
+  stats.counts["surfels"] = 5;
+  const StoredFrame frame = SomeFrame();
+  {
+    StoredJob job = NewJob("aaaaaaaa");
+    sqlite3* db = nullptr;
+    ASSERT_EQ(sqlite3_open((folder / "jobs.sqlite").c_str(), &db), SQLITE_OK);
+    const char* schema = R"sql(
+      CREATE TABLE jobs (
+        number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, submission TEXT UNIQUE,
+        spec BLOB NOT NULL, state INTEGER NOT NULL, error_code INTEGER NOT NULL DEFAULT 0,
+        error TEXT NOT NULL DEFAULT '', submitted_ms INTEGER NOT NULL, ended_ms INTEGER,
+        camera BLOB, blobs BLOB, notes BLOB, bake_stats BLOB, fingerprint BLOB,
+        reissued INTEGER NOT NULL DEFAULT 0, refused INTEGER NOT NULL DEFAULT 0);
+      CREATE TABLE tiles (
+        job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE, tile INTEGER NOT NULL,
+        sha256 BLOB NOT NULL, size INTEGER NOT NULL, stats BLOB NOT NULL,
+        PRIMARY KEY (job, tile)) WITHOUT ROWID;
+      CREATE TABLE events (
+        job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE, sequence INTEGER NOT NULL,
+        kind INTEGER NOT NULL, number INTEGER, data BLOB,
+        PRIMARY KEY (job, sequence)) WITHOUT ROWID;
+      CREATE TABLE bakes (key BLOB PRIMARY KEY, record BLOB NOT NULL) WITHOUT ROWID;
+      INSERT INTO events VALUES (1, 1, 1, 0, '');
+      PRAGMA user_version=1;
+    )sql";
+    ASSERT_EQ(sqlite3_exec(db, schema, nullptr, nullptr, nullptr), SQLITE_OK);
+    sqlite3_stmt* insert = nullptr;
+    ASSERT_EQ(sqlite3_prepare_v2(db,
+                                 "INSERT INTO jobs (id, submission, spec, state, submitted_ms, "
+                                 "camera, blobs, notes, bake_stats, reissued) "
+                                 "VALUES (?1, ?2, ?3, ?4, 77, ?5, ?6, ?7, ?8, 4)",
+                                 -1, &insert, nullptr),
+              SQLITE_OK);
+    const auto add = [&](const std::string& id, JobState state, bool baked) {
+      sqlite3_reset(insert);
+      sqlite3_clear_bindings(insert);
+      sqlite3_bind_text(insert, 1, id.c_str(), -1, SQLITE_TRANSIENT);
+      sqlite3_bind_text(insert, 2, ("submission of " + id).c_str(), -1, SQLITE_TRANSIENT);
+      const auto bind = [&](int at, const std::string& bytes) {
+        sqlite3_bind_blob(insert, at, bytes.data(), static_cast<int>(bytes.size()),
+                          SQLITE_TRANSIENT);
+      };
+      bind(3, ToWire(job.spec).SerializeAsString());
+      sqlite3_bind_int(insert, 4, static_cast<int>(state));
+      if (baked) {
+        bind(5, ToWire(frame.camera).SerializeAsString());
+        bind(6, ToWire(frame.blobs).SerializeAsString());
+        bind(7, notes.SerializeAsString());
+        bind(8, ToWire(stats).SerializeAsString());
+      }
+      EXPECT_EQ(sqlite3_step(insert), SQLITE_DONE);
+    };
+    add("aaaaaaaa", JobState::kRendering, true);
+    add("bbbbbbbb", JobState::kQueued, false);
+    sqlite3_finalize(insert);
+    sqlite3_close(db);
+  }
+  for (int opening = 0; opening < 2; ++opening) {
+    const auto store = OpenOrDie(folder.path());
+    ASSERT_NE(store, nullptr);
+    const auto jobs = store->LoadJobs();
+    ASSERT_TRUE(jobs.ok()) << jobs.status();
+    ASSERT_EQ(jobs->size(), 2u);
+    const StoredJob& a = (*jobs)[0];
+    EXPECT_EQ(a.state, JobState::kRendering);
+    EXPECT_FALSE(a.paused);
+    EXPECT_EQ(a.submitted_unix_ms, 77);
+    EXPECT_EQ(a.reissued, 4u);
+    ASSERT_EQ(a.frames.size(), 1u);
+    EXPECT_EQ(a.frames.at(0).blobs, frame.blobs);
+    EXPECT_EQ(a.notes, std::vector<std::string>{"a note"});
+    EXPECT_EQ(store->BakeStats(a.id)->counts.at("surfels"), 5u);
+    EXPECT_TRUE((*jobs)[1].frames.empty());
+    EXPECT_EQ(**store->FindSubmission("submission of bbbbbbbb"), (*jobs)[1].id);
+    EXPECT_EQ(store->Events(a.id, 0, 10)->front().unix_ms, 0);
+    if (opening == 0) {
+      EXPECT_TRUE(store->CommitTile(a.id, 0, ResultOf("x"), DigestOf("f")).ok());
+      EXPECT_TRUE(store->SetPaused((*jobs)[1].id, true).ok());
+      EXPECT_TRUE(store->SetPaused((*jobs)[1].id, false).ok());
+    } else {
+      EXPECT_TRUE(store->ReadTile(a.id, 0).ok());
+    }
+  }
 }
 
 TEST(JobStore, IsLockedAgainstOtherProcesses) {

@@ -33,6 +33,9 @@ TEST(BakeKey, ChangesWithWhatABakeReads) {
       [](JobSpec& j) {
         j.overrides.suns = {{{0, 1, 0}, {1, 1, 1}}};
       },
+      [](JobSpec& j) { j.overrides.lights.resize(1); },
+      [](JobSpec& j) { j.overrides.environment = EnvironmentOverride{.uri = "a.exr"}; },
+      [](JobSpec& j) { j.overrides.materials = {{.name = "m", .emission = Rgb(1, 1, 1)}}; },
   };
   for (size_t i = 0; i < changes.size(); ++i) {
     JobSpec job = SmallJob();
@@ -52,7 +55,22 @@ TEST(BakeKey, IsBlindToCameraFilmAndTiles) {
   job.settings.spp = 4;
   job.settings.tile_px = 32;
   job.settings.layers = {Layer::kBeauty};
+  job.settings.filter = PixelFilter::kBox;
+  job.settings.filter_width_px = 3;
+  job.frames = {1, 2};
+  job.fps = 12;
+  job.after = {{"00000001"}};
+  job.start_paused = true;
   EXPECT_EQ(BakeKey(job), BakeKey(SmallJob()));
+}
+
+TEST(BakeKey, OfAnAnimatedSceneChangesWithTime) {
+  const JobSpec job = SmallJob();
+  const Digest rest = BakeKeyAt(job, std::nullopt);
+  EXPECT_NE(rest, BakeKey(job));
+  EXPECT_NE(rest, BakeKeyAt(job, 0.0));
+  EXPECT_NE(BakeKeyAt(job, 1.0), BakeKeyAt(job, 0.0));
+  EXPECT_EQ(BakeKeyAt(job, 1.0), BakeKeyAt(job, 1.0));
 }
 
 TEST(CoreBaker, BakesAnAssetAndStopsWhenTold) {
@@ -64,7 +82,7 @@ TEST(CoreBaker, BakesAnAssetAndStopsWhenTold) {
   JobSpec spec = SmallJob();
   spec.settings.light_samples = 1;
   std::atomic<bool> cancel = false;
-  const auto result = baker->Bake(*asset, spec, cancel);
+  const auto result = baker->Bake(*asset, spec, std::nullopt, cancel);
   ASSERT_TRUE(result.ok()) << result.status();
   EXPECT_GT(result->blobs.prepared_scene.size(), 0u);
   EXPECT_GT(result->blobs.tree_topology.size(), 0u);
@@ -72,7 +90,7 @@ TEST(CoreBaker, BakesAnAssetAndStopsWhenTold) {
   EXPECT_FALSE(result->made_up_camera);
   EXPECT_GT(result->stats.wall_seconds[static_cast<size_t>(Stage::kImport)], 0);
   cancel = true;
-  EXPECT_TRUE(absl::IsCancelled(baker->Bake(*asset, spec, cancel).status()));
+  EXPECT_TRUE(absl::IsCancelled(baker->Bake(*asset, spec, std::nullopt, cancel).status()));
 }
 
 TEST(CoreBaker, ABrokenAssetIsThePersonsErrorNotOurs) {
@@ -80,7 +98,8 @@ TEST(CoreBaker, ABrokenAssetIsThePersonsErrorNotOurs) {
   asset.root = "a.gltf";
   asset.files["a.gltf"] = Blob::FromString("{ not json");
   std::atomic<bool> cancel = false;
-  EXPECT_TRUE(absl::IsInvalidArgument(MakeCoreBaker(1)->Bake(asset, SmallJob(), cancel).status()));
+  EXPECT_TRUE(absl::IsInvalidArgument(
+      MakeCoreBaker(1)->Bake(asset, SmallJob(), std::nullopt, cancel).status()));
 }
 
 }  // namespace
