@@ -66,7 +66,8 @@ std::array<uint32_t, 256> MakeCrcTable() {
 class PngWriter {
  public:
   PngWriter() {
-    for (const int byte : std::array<int, 8>{0x89, 80, 78, 71, 13, 10, 26, 10}) {  // "\x89PNG\r\n\x1a\n"
+    for (const int byte :
+         std::array<int, 8>{0x89, 80, 78, 71, 13, 10, 26, 10}) {  // "\x89PNG\r\n\x1a\n"
       Push(static_cast<uint8_t>(byte));
     }
   }

@@ -93,13 +93,13 @@ std::optional<std::string> Locate(const std::string& folder, const std::string& 
 }
 
 absl::Status Missing(const std::string& place, const std::string& path) {
-  return absl::NotFoundError(place + ": '" + path +
+  return absl::NotFoundError(place + ": '" + Printable(path) +
                              "' is missing; put the file beside the scene or correct the path");
 }
 
 class Parser {
  public:
-  Parser(const std::string& name, std::string_view text) : name_(name), lines_(text) {}
+  Parser(std::string name, std::string_view text) : name_(std::move(name)), lines_(text) {}
 
   absl::StatusOr<MtlFile> Run() {
     std::string_view line;
@@ -253,7 +253,7 @@ class Parser {
     return absl::OkStatus();
   }
 
-  const std::string& name_;
+  const std::string name_;
   LineReader lines_;
   MtlFile file_;
   size_t has_d_ = 0;  // number of the material that has a `d`
@@ -264,7 +264,7 @@ class Parser {
 
 absl::StatusOr<MtlFile> ParseMtl(const std::string& name, std::string_view text) {
   if (text.substr(0, 3) == "\xef\xbb\xbf") text.remove_prefix(3);
-  return Parser(name, text).Run();
+  return Parser(Printable(name), text).Run();
 }
 
 absl::StatusOr<ObjMaterials> ObjMaterials::Load(
@@ -300,7 +300,8 @@ absl::StatusOr<ObjMaterials> ObjMaterials::Load(
           if (!map.present()) return absl::OkStatus();
           const auto found = Locate(FolderOf(uri), map.path, source);
           if (!found) {
-            return Missing(root + ": " + uri + ": line " + std::to_string(map.line), map.path);
+            return Missing(root + ": " + Printable(uri) + ": line " + std::to_string(map.line),
+                           map.path);
           }
           FP_RETURN_IF_ERROR(source.Read(*found).status());
           out = MtlTexture{*found, map};

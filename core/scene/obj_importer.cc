@@ -127,7 +127,7 @@ class ObjReader {
     if (key == "vn") return ReadNormal(rest);
     if (key == "f" || key == "fo") return ReadFace(rest);
     if (key == "o" || key == "g") {
-      (key == "o" ? object_ : group_) = std::string(Trim(rest));
+      (key == "o" ? object_ : group_) = Printable(Trim(rest));
       if (key == "o") group_.clear();
       current_part_.fill(kNone);
       return absl::OkStatus();
@@ -393,17 +393,17 @@ class ObjReader {
   absl::Status AddMaterial(const ObjMaterials::Entry& entry, size_t name_index) {
     const MtlMaterial& m = entry.material;
     Material material;
-    material.name = m.name;
+    material.name = Printable(m.name);
     material.metallic = static_cast<float>(m.metallic);
     material.roughness = static_cast<float>(m.roughness);
     material.base_color = m.diffuse.value_or(Rgb(1));
     if (entry.diffuse && material.base_color == Rgb()) {
-      Note("material '" + m.name + "': Kd 0 would hide its map_Kd; taken as 1");
+      Note("material '" + material.name + "': Kd 0 would hide its map_Kd; taken as 1");
       material.base_color = Rgb(1);
     }
     material.emission = m.emission.value_or(entry.emission ? Rgb(1) : Rgb());
     if (entry.emission && material.emission == Rgb()) {
-      Note("material '" + m.name + "': Ke 0 would hide its map_Ke; taken as 1");
+      Note("material '" + material.name + "': Ke 0 would hide its map_Ke; taken as 1");
       material.emission = Rgb(1);
     }
     if (entry.emission) {
@@ -445,9 +445,9 @@ class ObjReader {
     return TextureRef{it->second, 0, TransformOf(source.map)};
   }
 
-  void PushTexture(std::string name, Blob encoded, bool clamp) {
+  void PushTexture(const std::string& name, Blob encoded, bool clamp) {
     Texture texture;
-    texture.name = std::move(name);
+    texture.name = Printable(name);
     texture.encoded = std::move(encoded);
     texture.wrap_s = texture.wrap_t = clamp ? WrapMode::kClampToEdge : WrapMode::kRepeat;
     imported_.scene.textures.push_back(std::move(texture));
@@ -463,17 +463,19 @@ class ObjReader {
     if (is_new) {
       std::optional<DecodedImage> color;
       FP_ASSIGN_OR_RETURN(const Blob opacity_file, asset_.Find(opacity.uri));
-      FP_ASSIGN_OR_RETURN(DecodedImage mask, DecodeImage(opacity.uri, opacity_file.bytes()));
+      FP_ASSIGN_OR_RETURN(DecodedImage mask,
+                          DecodeImage(Printable(opacity.uri), opacity_file.bytes()));
       if (entry.diffuse && main.uri != opacity.uri) {
         FP_ASSIGN_OR_RETURN(const Blob file, asset_.Find(main.uri));
-        FP_ASSIGN_OR_RETURN(color, DecodeImage(main.uri, file.bytes()));
+        FP_ASSIGN_OR_RETURN(color, DecodeImage(Printable(main.uri), file.bytes()));
       }
-      FP_ASSIGN_OR_RETURN(Blob merged, MergeOpacity(color ? &*color : nullptr, mask,
-                                                    entry.diffuse.has_value(), opacity.uri));
+      FP_ASSIGN_OR_RETURN(Blob merged,
+                          MergeOpacity(color ? &*color : nullptr, mask, entry.diffuse.has_value(),
+                                       Printable(opacity.uri)));
       PushTexture(opacity.uri, std::move(merged), main.map.clamp);
       const MtlMap &a = main.map, &b = opacity.map;
       if (!(a.scale == b.scale) || !(a.offset == b.offset) || a.clamp != b.clamp) {
-        Note("material '" + entry.material.name +
+        Note("material '" + Printable(entry.material.name) +
              "': map_d has other -s, -o or -clamp than map_Kd, whose are used");
       }
     }

@@ -197,7 +197,7 @@ class PlyReader {
       }
       if (key == "element") {
         Element element;
-        element.name = std::string(NextWord(rest));
+        element.name = Printable(NextWord(rest));
         const std::string_view word = NextWord(rest);
         const auto count = ParseInteger(word);
         if (element.name.empty() || !count || *count < 0) {
@@ -227,7 +227,7 @@ class PlyReader {
         if (property.type == nullptr) {
           return FailHeader(line_number, Quoted(type) + " is no type of numbers");
         }
-        property.name = std::string(NextWord(rest));
+        property.name = Printable(NextWord(rest));
         header_.elements.back().properties.push_back(std::move(property));
       } else {
         return FailHeader(line_number, Quoted(key) +

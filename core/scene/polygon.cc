@@ -99,7 +99,7 @@ class EarClipper {
       misses = 0;
     }
     triangles.push_back({previous_[i], i, next_[i]});
-    return clean;
+    return clean && Orientation(points_[previous_[i]], points_[i], points_[next_[i]]) >= 0;
   }
 
  private:

@@ -16,6 +16,25 @@ std::string_view WithoutPlus(std::string_view word) {
   return word;
 }
 
+// Bytes of the printable character that `text` begins with; 0 if it begins with none (RFC 3629).
+size_t Utf8Length(std::string_view text) {
+  const auto byte = [&](size_t i) { return static_cast<unsigned char>(text[i]); };
+  const unsigned first = byte(0);
+  if (first < 0x80) return first >= 32 && first != 127 ? 1 : 0;
+  const size_t length = first >= 0xc2 && first < 0xe0   ? 2
+                        : first >= 0xe0 && first < 0xf0 ? 3
+                        : first >= 0xf0 && first < 0xf5 ? 4
+                                                        : 0;
+  if (length == 0 || length > text.size()) return 0;
+  for (size_t i = 1; i < length; ++i) {
+    if ((byte(i) & 0xc0) != 0x80) return 0;
+  }
+  // Too long a form, a surrogate, or beyond U+10FFFF.
+  const bool bad = (first == 0xe0 && byte(1) < 0xa0) || (first == 0xed && byte(1) > 0x9f) ||
+                   (first == 0xf0 && byte(1) < 0x90) || (first == 0xf4 && byte(1) > 0x8f);
+  return bad ? 0 : length;
+}
+
 }  // namespace
 
 bool LineReader::NextRaw(std::string_view& line) {
@@ -88,14 +107,26 @@ std::optional<int64_t> ParseInteger(std::string_view word) {
   return value;
 }
 
+std::string Printable(std::string_view text) {
+  std::string printable;
+  printable.reserve(text.size());
+  size_t i = 0;
+  while (i < text.size()) {
+    const size_t length = Utf8Length(text.substr(i));
+    printable += length == 0 ? "?" : text.substr(i, length);
+    i += std::max<size_t>(length, 1);
+  }
+  return printable;
+}
+
 std::string Quoted(std::string_view text) {
   constexpr size_t kLongest = 40;
-  std::string quoted = "'";
-  for (const char c : text.substr(0, kLongest)) {
-    const auto byte = static_cast<unsigned char>(c);
-    quoted += byte < 32 || byte == 127 ? '?' : c;
+  size_t end = std::min(text.size(), kLongest);
+  // Not within a character.
+  while (end < text.size() && end > 0 && (static_cast<unsigned char>(text[end]) & 0xc0) == 0x80) {
+    --end;
   }
-  return quoted + (text.size() > kLongest ? "…'" : "'");
+  return "'" + Printable(text.substr(0, end)) + (end < text.size() ? "…'" : "'");
 }
 
 }  // namespace farpoint

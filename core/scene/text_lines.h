@@ -42,7 +42,11 @@ std::optional<double> ParseNumber(std::string_view word);
 // The whole word as an integer, with or without a sign. Nothing if it is none or beyond 64 bits.
 std::optional<int64_t> ParseInteger(std::string_view word);
 
-// For messages: at most 40 bytes of `text`, quoted, with what cannot be printed replaced.
+// `text` as valid UTF-8 without control characters: each byte that is part of neither is a '?'.
+// Names of files in older encodings stay recognisable, and messages can travel.
+std::string Printable(std::string_view text);
+
+// For messages: the beginning of `text`, at most 40 bytes, printable and quoted.
 std::string Quoted(std::string_view text);
 
 }  // namespace farpoint

@@ -462,5 +462,135 @@ TEST(GltfImporter, ReadsBinaryContainers) {
   EXPECT_EQ(imported->scene.meshes.at(0).positions.size(), 3u);
 }
 
+TEST(GltfImporter, CopiesInstancesOfTheInstancingExtension) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["extensionsRequired"] = {"EXT_mesh_gpu_instancing"};
+  const float h = std::sqrt(0.5f);
+  Json attributes = {{"TRANSLATION", gltf.Accessor<float>({0, 0, 0, 10, 0, 0}, 5126, "VEC3", 3)},
+                     {"ROTATION", gltf.Accessor<float>({0, 0, 0, 1, 0, 0, h, h}, 5126, "VEC4", 4)},
+                     {"SCALE", gltf.Accessor<float>({1, 1, 1, 2, 3, 4}, 5126, "VEC3", 3)},
+                     {"_ID", gltf.Accessor<float>({5}, 5126, "SCALAR", 1)}};
+  gltf.json["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"] = attributes;
+  gltf.json["nodes"][0]["translation"] = {0, 0, 5};
+  const Scene scene = ImportOk(gltf);
+  ASSERT_EQ(scene.instances.size(), 2u);
+  EXPECT_EQ(scene.instances[0].mesh, scene.instances[1].mesh);
+  EXPECT_EQ(scene.instances[0].world_from_mesh.translation, Vec3d(0, 0, 5));
+  const Affine& m = scene.instances[1].world_from_mesh;
+  EXPECT_EQ(m.translation, Vec3d(10, 0, 5));
+  for (int i = 0; i < 3; ++i) {
+    EXPECT_NEAR(m.column[0][i], Vec3d(0, 2, 0)[i], 1e-6);
+    EXPECT_NEAR(m.column[1][i], Vec3d(-3, 0, 0)[i], 1e-6);
+    EXPECT_NEAR(m.column[2][i], Vec3d(0, 0, 4)[i], 1e-6);
+  }
+  EXPECT_EQ(gltf.Import({.max_triangles = 1}).status().code(),
+            absl::StatusCode::kResourceExhausted);
+  auto& places = gltf.json["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"];
+  places["SCALE"] = gltf.Accessor<float>({1, 1, 1}, 5126, "VEC3", 3);
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("EXT_mesh_gpu_instancing/attributes/"));
+  places = {{"TRANSLATION", gltf.json["accessors"].size()}};
+  gltf.json["accessors"].push_back({{"componentType", 5126}, {"count", 1 << 24}, {"type", "VEC3"}});
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("has no bufferView"));
+  places = {{"TRANSLATION", gltf.Accessor<float>({NAN, 0, 0}, 5126, "VEC3", 3)}};
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("instance 0 is not finite"));
+}
+
+TEST(GltfImporter, MultipliesTheBaseColourByColoursOfVertices) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["materials"] = {{{"pbrMetallicRoughness", {{"baseColorFactor", {0.5, 1, 1, 1}}}}}};
+  Primitive(gltf)["material"] = 0;
+  // The same at all vertices: exact.
+  Primitive(gltf)["attributes"]["COLOR_0"] =
+      gltf.Accessor<float>({0.5f, 0.25f, 1, 0.5f, 0.25f, 1, 0.5f, 0.25f, 1}, 5126, "VEC3", 3);
+  Scene scene = ImportOk(gltf);
+  ASSERT_EQ(scene.meshes[0].material, 1);
+  EXPECT_EQ(scene.materials[1].base_color, Rgb(0.25f, 0.25f, 1));
+  EXPECT_EQ(scene.materials[0].base_color, Rgb(0.5f, 1, 1));
+  EXPECT_THAT(NotesOf(gltf), IsEmpty());
+  // Others in their mean, with a note; alpha too.
+  const auto colors =
+      gltf.Accessor<uint8_t>({255, 0, 0, 255, 0, 255, 0, 255, 0, 0, 255, 0}, 5121, "VEC4", 4);
+  gltf.json["accessors"][colors]["normalized"] = true;
+  Primitive(gltf)["attributes"]["COLOR_0"] = colors;
+  Primitive(gltf).erase("material");
+  scene = ImportOk(gltf);
+  const Material& mean = scene.materials.at(static_cast<size_t>(scene.meshes[0].material));
+  for (int c = 0; c < 3; ++c) EXPECT_NEAR(mean.base_color[c], 1 / 3.0, 1e-6);
+  EXPECT_NEAR(mean.base_alpha, 2 / 3.0, 1e-6);
+  EXPECT_THAT(NotesOf(gltf), HasSubstr("1 primitive with colours at the vertices"));
+  gltf.json["accessors"][colors]["normalized"] = false;
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("/attributes/COLOR_0: accessor"));
+}
+
+TEST(GltfImporter, TakesTheDiffusePartOfSpecularGlossiness) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["images"] = {{{"uri", "data:image/png;base64," + Base64(MakePng(1, 1, {0, 0, 0, 0}))}}};
+  gltf.json["textures"] = {{{"source", 0}}};
+  Json extension = {{"diffuseFactor", {0.1, 0.2, 0.3, 0.4}}};
+  extension["diffuseTexture"] = {{"index", 0}, {"texCoord", 1}};
+  extension["diffuseTexture"]["extensions"]["KHR_texture_transform"]["scale"] = {3, 4};
+  gltf.json["materials"] = Json::array({Json::object()});
+  gltf.json["materials"][0]["extensions"]["KHR_materials_pbrSpecularGlossiness"] = extension;
+  gltf.json["extensionsRequired"] = {"KHR_materials_pbrSpecularGlossiness"};
+  Scene scene = ImportOk(gltf);
+  const Material& m = scene.materials.at(0);
+  EXPECT_EQ(m.base_color, Rgb(0.1f, 0.2f, 0.3f));
+  EXPECT_EQ(m.base_alpha, 0.4f);
+  EXPECT_EQ(m.base_color_texture.texture, 0);
+  EXPECT_EQ(m.base_color_texture.uv_set, 1u);
+  EXPECT_EQ(m.base_color_texture.transform.scale, (Vec2f{3, 4}));
+  EXPECT_GT(scene.textures.at(0).encoded.size(), 0u);
+  gltf.json["materials"][0]["extensions"]["KHR_materials_pbrSpecularGlossiness"]["diffuseFactor"] =
+      {1, 1, 1};
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("diffuseFactor: has 3 numbers"));
+}
+
+TEST(GltfImporter, NotesExtensionsThatChangeTheLook) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["extensionsUsed"] = {"KHR_materials_unlit", "KHR_materials_variants",
+                                 "EXT_mesh_gpu_instancing"};
+  EXPECT_THAT(NotesOf(gltf),
+              AllOf(HasSubstr("'KHR_materials_unlit' is ignored: its materials"),
+                    HasSubstr("the default materials are shown"), Not(HasSubstr("instancing"))));
+  gltf.json["extensionsRequired"] = {"KHR_materials_variants"};
+  EXPECT_TRUE(gltf.Import().ok());
+}
+
+TEST(GltfImporter, SaysWhatIsWrongWithATinyGlb) {
+  for (const char* text : {"", "g", "glT", "{}", "nonsense that is longer than a header"}) {
+    const auto imported = ImportScene({"a.glb", {{"a.glb", Blob::FromString(text)}}}, {});
+    EXPECT_THAT(std::string(imported.status().message()),
+                AllOf(HasSubstr("a.glb: byte 0: is no .glb"), HasSubstr("export")));
+  }
+  const auto header = ImportScene({"a.glb", {{"a.glb", Blob::FromString("glTF\2")}}}, {});
+  EXPECT_THAT(std::string(header.status().message()), HasSubstr("a.glb: byte 5: ends inside"));
+}
+
+TEST(GltfImporter, NamesTheAllowedRange) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["materials"] = {{{"pbrMetallicRoughness", {{"metallicFactor", 1.5}}}}};
+  EXPECT_THAT(MessageOf(gltf), HasSubstr("metallicFactor: is 1.5, outside of [0, 1]"));
+}
+
+TEST(GltfImporter, RefusesJsonOfAMillionLevels) {
+  const std::string deep = "{\"asset\": " + std::string(1'000'000, '[');
+  const auto imported = ImportScene({"a.gltf", {{"a.gltf", Blob::FromString(deep)}}}, {});
+  EXPECT_THAT(std::string(imported.status().message()),
+              AllOf(HasSubstr("a.gltf: byte"), HasSubstr("nested")));
+}
+
+TEST(GltfImporter, RefusesOffsetsAndCountsThatOverflow) {
+  const uint64_t huge[] = {uint64_t{1} << 31, (uint64_t{1} << 32) - 1, uint64_t{1} << 32,
+                           (uint64_t{1} << 63) - 1, ~uint64_t{0}};
+  for (const uint64_t value : huge) {
+    for (const char* field : {"/accessors/0/count", "/accessors/0/byteOffset",
+                              "/bufferViews/0/byteOffset", "/bufferViews/0/byteLength"}) {
+      TinyGltf gltf = TriangleGltf();
+      gltf.json[Json::json_pointer(field)] = value;
+      EXPECT_THAT(MessageOf(gltf), HasSubstr(std::string(field).substr(0, 10))) << value;
+    }
+  }
+}
+
 }  // namespace
 }  // namespace farpoint
