@@ -1,12 +1,13 @@
 // A light tree (Conty Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive
-// Tree Splitting"; bounds of light as in pbrt, 4th edition, 12.6.3) of eight children a node, so
-// that one step looks three binary levels ahead. Its leaves are blocks of up to eight lights, which
-// the caller weighs himself, as exactly as he likes.
+// Tree Splitting"; bounds of light as in pbrt, 4th edition, 12.6.3) of eight children a node. Its
+// leaves are blocks of up to eight lights, which the caller weighs himself, as exactly as he likes.
 //
 // A light is bounded by a box, a cone of directions and a power. What a node may send to a point:
 //   power cosθ_receiver cosθ_emitter / d²,
 // each cosine the largest that sphere and cone allow, d² at least what the node's own size is. It
-// is 0 only where nothing can arrive.
+// is 0 only where nothing can arrive. The choice among a node's children goes by the sums over
+// *their* children (or by the blocks themselves), so each step looks six binary levels ahead: near
+// a node its own bound says little.
 #pragma once
 
 #include <algorithm>
@@ -60,6 +61,7 @@ class LightTree {
    private:
     friend class LightTree;
     static constexpr uint32_t kSlots = 32;
+    static uint32_t SlotOf(uint32_t at) { return (2 * at + (at >> 31)) % kSlots; }
     std::array<uint32_t, kSlots> key_;
     alignas(32) std::array<Weights, kSlots> weight_;
   };
@@ -112,14 +114,27 @@ std::optional<LightTree::Choice> LightTree::Choose(const Vec3f& p, const Vec3f& 
   for (;;) {
     const bool is_block = (at & kBlock) != 0;
     const uint32_t index = at & ~kBlock;
-    const uint32_t slot = (2 * index + (is_block ? 1 : 0)) % Cache::kSlots;
+    const uint32_t slot = Cache::SlotOf(at);
     Weights& weight = cache.weight_[slot];
     if (cache.key_[slot] != at) {
       cache.key_[slot] = at;
       if (is_block) {
         block_weights(index, weight);
       } else {
-        NodeWeights(nodes_[index], p, n, weight);
+        const Node& node = nodes_[index];
+        alignas(32) Weights bound, below;
+        NodeWeights(node, p, n, bound);
+        for (uint32_t k = 0; k < kWidth; ++k) {
+          weight[k] = 0;
+          if (!(bound[k] > 0)) continue;
+          const uint32_t child = node.child[k];
+          if ((child & kBlock) != 0) {
+            block_weights(child & ~kBlock, below);
+          } else {
+            NodeWeights(nodes_[child], p, n, below);
+          }
+          for (const float w : below) weight[k] += w;
+        }
       }
     }
     double total = 0;
