@@ -5,10 +5,13 @@
 #include <atomic>
 #include <chrono>
 #include <functional>
+#include <limits>
 #include <memory>
+#include <mutex>
 #include <string>
 #include <thread>
 #include <utility>
+#include <vector>
 
 #include "core/image/film.h"
 #include "server/scene_baker.h"
@@ -22,17 +25,26 @@ class FakeBaker final : public SceneBaker {
                                   std::optional<double> time_s,
                                   const std::atomic<bool>& cancel) override {
     ++bakes;
-    while (hold.load()) {
+    if (time_s && animated) {
+      std::lock_guard lock(mutex);
+      times.push_back(*time_s);
+    }
+    while (hold.load() || (time_s && *time_s >= hold_from_s.load())) {
       if (cancel.load()) return absl::CancelledError("stopped");
       std::this_thread::sleep_for(std::chrono::milliseconds(1));
     }
-    if (!error.ok()) return error;
+    if (!error.ok() && (!time_s || *time_s >= error_from_s)) return error;
     FP_ASSIGN_OR_RETURN(const Blob root, asset.Find(asset.root));
     BakeResult result;
     result.blobs.prepared_scene = root;
+    result.animated = animated;
+    if (animated && time_s) {
+      result.blobs.prepared_scene = Blob::FromString("at " + std::to_string(*time_s));
+    }
     result.blobs.tree_topology = Blob::FromString("topology");
     result.cameras.resize(1);
     result.cameras[0].name = "main";
+    if (animated && time_s) result.cameras[0].eye = {*time_s, 0, 0};
     result.notes = {"no camera: one was made up", "another note"};
     result.made_up_camera = true;
     result.stats.counts["triangles"] = 12;
@@ -42,7 +54,13 @@ class FakeBaker final : public SceneBaker {
   }
   std::atomic<int> bakes = 0;
   std::atomic<bool> hold = false;  // bakes wait
-  absl::Status error;              // set before the first job
+  // Set before the first job:
+  absl::Status error;
+  double error_from_s = 0;  // frames before it are baked all the same
+  bool animated = false;    // each time has a scene and a camera of its own
+  std::atomic<double> hold_from_s = std::numeric_limits<double>::infinity();
+  std::mutex mutex;
+  std::vector<double> times;  // of an animated scene, as they were asked for; guarded by mutex
 };
 
 // The value of a pixel: unlike anything else's.

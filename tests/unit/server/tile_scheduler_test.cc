@@ -407,6 +407,143 @@ TEST_F(TileSchedulerTest, ProgressAndEtaFollowTheTiles) {
   EXPECT_DOUBLE_EQ(scheduler_.Progress({"a"}), 0.375);
 }
 
+TEST_F(TileSchedulerTest, OnlyOpenTilesAreLeased) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 4;
+  job.committed = {3};
+  job.fingerprint = DigestOf("f");
+  job.open = false;
+  scheduler_.AddJob(job);
+  const WorkerId w = AddWorker("w");
+  EXPECT_FALSE(scheduler_.Lease(w).has_value());
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.queued = 3, .committed = 1, .total = 4}));
+  EXPECT_EQ(scheduler_.Leasable({"a"}), 0u);
+  scheduler_.OpenTiles({"a"}, 2, 2);
+  EXPECT_EQ(scheduler_.Leasable({"a"}), 1u);
+  EXPECT_EQ(Render(w), 2u);
+  EXPECT_FALSE(scheduler_.Lease(w).has_value());
+  scheduler_.OpenTiles({"a"}, 0, 2);
+  EXPECT_EQ(Render(w), 0u);
+  EXPECT_EQ(Render(w), 1u);
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.committed = 4, .total = 4}));
+}
+
+TEST_F(TileSchedulerTest, AFailedJobsClosedTilesFailToo) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 4;
+  job.open = false;
+  scheduler_.AddJob(job);
+  scheduler_.OpenTiles({"a"}, 0, 1);
+  const WorkerId w = AddWorker("w");
+  const auto grant = scheduler_.Lease(w);
+  const SchedulerNews news =
+      scheduler_.ReportFailure(w, grant->lease, false, absl::InvalidArgumentError("bad"));
+  ASSERT_EQ(news.failed.size(), 1u);
+  EXPECT_EQ(news.failed[0].tile, 0u);
+  EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.failed = 4, .total = 4}));
+}
+
+TEST_F(TileSchedulerTest, APausedJobGivesNoTilesButTakesResults) {
+  AddJob("a", 3);
+  AddJob("b", 1);
+  const WorkerId w1 = AddWorker("1"), w2 = AddWorker("2");
+  const auto in_work = scheduler_.Lease(w1);
+  scheduler_.SetPaused({"a"}, true);
+  EXPECT_EQ(scheduler_.Lease(w2)->job, JobId{"b"});
+  EXPECT_FALSE(scheduler_.Renew(w1, in_work->lease, {1, 0.5f}).drop);
+  ASSERT_TRUE(scheduler_.BeginCommit(w1, in_work->lease, in_work->attempt).ok());
+  EXPECT_TRUE(scheduler_.FinishCommit(in_work->lease, true));
+  EXPECT_FALSE(scheduler_.Lease(w1).has_value());
+  scheduler_.SetPaused({"a"}, false);
+  scheduler_.SetPaused({"a"}, false);
+  EXPECT_EQ(scheduler_.Lease(w1)->job, JobId{"a"});
+}
+
+TEST_F(TileSchedulerTest, ASlowTileOfAPausedJobIsNotCopied) {
+  AddJob("a", 2);
+  const WorkerId w1 = AddWorker("1"), w2 = AddWorker("2");
+  Render(w1);
+  const auto slow = scheduler_.Lease(w1);
+  for (int i = 0; i < 10; ++i) Beat(*slow, seconds(2), true);
+  scheduler_.SetPaused({"a"}, true);
+  EXPECT_FALSE(scheduler_.Lease(w2).has_value());
+  scheduler_.SetPaused({"a"}, false);
+  EXPECT_TRUE(scheduler_.Lease(w2)->speculative);
+}
+
+TEST_F(TileSchedulerTest, APauseCountsNotAsTimeOfTheJob) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 2;
+  job.max_time = seconds(100);
+  scheduler_.AddJob(job);
+  const WorkerId w = AddWorker("w");
+  Render(w, seconds(60));
+  scheduler_.SetPaused({"a"}, true);
+  EXPECT_FALSE(scheduler_.EtaSeconds({"a"}).has_value());
+  clock_.Advance(seconds(1000));
+  EXPECT_THAT(scheduler_.Tick().failed, IsEmpty());
+  scheduler_.SetPaused({"a"}, false);
+  EXPECT_NEAR(*scheduler_.EtaSeconds({"a"}), 60, 1e-6);
+  clock_.Advance(seconds(39));
+  EXPECT_THAT(scheduler_.Tick().failed, IsEmpty());
+  clock_.Advance(seconds(2));
+  EXPECT_EQ(scheduler_.Tick().failed.size(), 1u);
+}
+
+TEST_F(TileSchedulerTest, AnotherPriorityHoldsFromTheNextLeaseOn) {
+  AddJob("a", 2);
+  AddJob("b", 2);
+  const WorkerId w = AddWorker("w");
+  const auto grant_of = [&] { return scheduler_.Lease(w)->job; };
+  EXPECT_EQ(grant_of(), JobId{"a"});
+  scheduler_.SetPriority({"b"}, 1);
+  EXPECT_EQ(grant_of(), JobId{"b"});
+  scheduler_.SetPriority({"b"}, -1);
+  EXPECT_EQ(grant_of(), JobId{"a"});
+}
+
+TEST_F(TileSchedulerTest, ForgottenFailuresCountNoMore) {
+  AddJob("a", 1);
+  for (int i = 0; i < 2; ++i) {
+    const WorkerId w = AddWorker("bad" + std::to_string(i));
+    const auto grant = scheduler_.Lease(w);
+    scheduler_.ReportFailure(w, grant->lease, false, absl::InternalError("boom"));
+  }
+  const JobReport before = scheduler_.Report({"a"});
+  ASSERT_EQ(before.troubled.size(), 1u);
+  EXPECT_EQ(before.troubled[0].failures, 2u);
+  EXPECT_EQ(before.troubled[0].workers, 2u);
+  EXPECT_EQ(before.troubled[0].cause, "boom");
+  scheduler_.ForgetFailures({"a"});
+  EXPECT_THAT(scheduler_.Report({"a"}).troubled, IsEmpty());
+  const WorkerId w = AddWorker("third");
+  const auto grant = scheduler_.Lease(w);
+  EXPECT_THAT(scheduler_.ReportFailure(w, grant->lease, false, absl::InternalError("boom")).failed,
+              IsEmpty());
+}
+
+TEST_F(TileSchedulerTest, ReportsTilesInWorkTheLongestFirst) {
+  AddJob("a", 3);
+  const WorkerId w1 = AddWorker("1"), w2 = AddWorker("2");
+  const auto first = scheduler_.Lease(w1);
+  clock_.Advance(seconds(2));
+  const auto second = scheduler_.Lease(w2);
+  Beat(*second, seconds(1), true);
+  const JobReport report = scheduler_.Report({"a"});
+  EXPECT_EQ(report.leasable, 1u);
+  ASSERT_EQ(report.in_work.size(), 2u);
+  EXPECT_EQ(report.in_work[0].grant.tile, first->tile);
+  EXPECT_NEAR(report.in_work[0].seconds, 3, 1e-6);
+  EXPECT_EQ(report.in_work[1].fraction, 0.5f);
+  EXPECT_EQ(scheduler_.JobOf(first->lease), JobId{"a"});
+  scheduler_.RemoveWorker(w1);
+  EXPECT_EQ(scheduler_.JobOf(first->lease), JobId{"a"});  // ended, but remembered
+  EXPECT_EQ(scheduler_.JobOf({"unknown"}), JobId{});
+}
+
 // Whatever happens in whatever order: the tiles add up, a tile is committed once, and in the end
 // all are.
 class RandomEvents : public ::testing::TestWithParam<uint32_t> {};
@@ -473,6 +610,12 @@ TEST_P(RandomEvents, KeepTheInvariants) {
         break;
       case 2:
         clock.Advance(milliseconds(random() % 4000));
+        if (!totals.empty()) {
+          const JobId id = std::next(totals.begin(), random() % totals.size())->first;
+          scheduler.SetPaused(id, random() % 3 == 0);
+          scheduler.SetPriority(id, static_cast<int32_t>(random() % 3));
+          if (random() % 4 == 0) scheduler.ForgetFailures(id);
+        }
         break;
       case 3: {
         const SchedulerNews news = scheduler.Tick();
@@ -536,6 +679,7 @@ TEST_P(RandomEvents, KeepTheInvariants) {
   for (Held& h : held) {
     if (h.committing) finish(h, true);
   }
+  for (const auto& [id, total] : totals) scheduler.SetPaused(id, false);
   clock.Advance(std::chrono::hours(1));
   scheduler.Tick();
   scheduler.AddWorker({"good-usual"}, {.fingerprint = DigestOf("usual")});
