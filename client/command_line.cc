@@ -9,6 +9,7 @@
 #include <memory>
 #include <string_view>
 
+#include "client/frame_range.h"
 #include "client/nearest_name.h"
 #include "core/base/blob.h"
 
@@ -51,6 +52,7 @@ class Options {
     app_.allow_extras();
     app_.add_flag("-h,--help", help_);
     names_.push_back("--help");
+    switches_.push_back("--help");
     entries_.push_back({"General", "-h, --help", "print this help"});
   }
 
@@ -66,6 +68,29 @@ class Options {
                                      : names.substr(0, comma) + ", " + names.substr(comma + 1)) +
              " " + metavar,
          help});
+  }
+
+  // May be repeated; each value may be several with commas.
+  void List(const std::string& name, const std::string& metavar, std::vector<std::string>& target,
+            const std::string& help, const std::string& group) {
+    std::vector<std::string>& values = value_lists_.emplace_back();
+    app_.add_option(name, values)->allow_extra_args(false);
+    names_.push_back(name);
+    entries_.push_back({group, name + " " + metavar, help});
+    checks_.push_back([=, &values, &target]() -> absl::Status {
+      for (std::string_view rest : values) {
+        while (true) {
+          const size_t comma = rest.find(',');
+          if (comma == 0 || rest.empty()) {
+            return Bad(name + ": expected " + metavar + " without empty places");
+          }
+          target.emplace_back(rest.substr(0, comma));
+          if (comma == std::string_view::npos) break;
+          rest.remove_prefix(comma + 1);
+        }
+      }
+      return absl::OkStatus();
+    });
   }
 
   void Flag(const std::string& name, bool& target, const std::string& help,
@@ -84,24 +109,32 @@ class Options {
     CLI::Option* option = app_.get_option(name);
     checks_.push_back([=, &text, &target]() -> absl::Status {
       if (option->count() == 0) return absl::OkStatus();
-      T value{};
-      const char* end = text.data() + text.size();
-      const auto result = std::from_chars(text.data(), end, value);
-      if (result.ec != std::errc() || result.ptr != end || !(value >= min) || !(value <= max)) {
-        std::ostringstream message;
-        message << name << " " << text << ": expected a "
-                << (std::is_integral_v<T> ? "whole number" : "number") << " from " << min << " to "
-                << max;
-        return Bad(message.str());
-      }
-      target = value;
-      return absl::OkStatus();
+      return ParseNumber(name, text, target, min, max);
     });
   }
 
   void Positional(const std::string& name, std::string& target, const std::string& help) {
     app_.add_option(name, target);
     entries_.push_back({"", name, help});
+  }
+  // All that stand beside flags.
+  void Positionals(const std::string& name, std::vector<std::string>& target,
+                   const std::string& help) {
+    app_.add_option(name, target);
+    entries_.push_back({"", name, help});
+  }
+  // After the positionals above. May be negative, though it then looks like a flag.
+  template <typename T>
+  void PositionalNumber(const std::string& name, std::optional<T>& target, T min, T max,
+                        const std::string& help) {
+    number_ = &texts_.emplace_back();
+    std::string& text = *number_;
+    app_.add_option(name, text);
+    entries_.push_back({"", name, help});
+    checks_.push_back([=, &text, &target]() -> absl::Status {
+      if (text.empty()) return absl::OkStatus();
+      return ParseNumber(name, text, target, min, max);
+    });
   }
 
   void Render(std::vector<GivenFlag>& given) {
@@ -133,9 +166,36 @@ class Options {
     }
   }
 
+  // Before the line is split: what CLI11 would refuse in words of its own.
+  absl::Status CheckValues(std::span<const std::string> args) const {
+    for (size_t i = 0; i < args.size() && args[i] != "--"; ++i) {
+      const size_t equals = args[i].find('=');
+      const std::string name = args[i].substr(0, equals);
+      if (!Knows(name) && name != "-o") continue;
+      if (IsSwitch(name)) {
+        if (equals == std::string::npos) continue;
+        return Bad(name + ": is a switch and takes no value");
+      }
+      const bool joined = equals != std::string::npos;
+      const std::string value = joined                ? args[i].substr(equals + 1)
+                                : i + 1 < args.size() ? args[i + 1]
+                                                      : std::string();
+      if (value.empty() || (!joined && Knows(value.substr(0, value.find('='))))) {
+        return Bad(name + ": needs a value; see farpoint " + app_.get_name() + " --help");
+      }
+      if (!joined) ++i;
+    }
+    return absl::OkStatus();
+  }
+
   // After the line was split.
   absl::Status Check() const {
-    const std::vector<std::string> extras = app_.remaining();
+    std::vector<std::string> extras = app_.remaining();
+    if (number_ != nullptr && number_->empty() && !extras.empty() && extras[0].size() > 1 &&
+        extras[0][0] == '-' && extras[0][1] >= '0' && extras[0][1] <= '9') {
+      *number_ = extras[0];
+      extras.erase(extras.begin());
+    }
     for (const std::string& extra : extras) {
       if (extra.size() > 1 && extra[0] == '-' && extra != "--") {
         return Unknown(extra.substr(0, extra.find('=')));
@@ -193,6 +253,23 @@ class Options {
     std::string group, names, help;
   };
 
+  template <typename T>
+  static absl::Status ParseNumber(const std::string& name, const std::string& text,
+                                  std::optional<T>& target, T min, T max) {
+    T value{};
+    const char* end = text.data() + text.size();
+    const auto result = std::from_chars(text.data(), end, value);
+    if (result.ec != std::errc() || result.ptr != end || !(value >= min) || !(value <= max)) {
+      std::ostringstream message;
+      message << name << " " << text << ": expected a "
+              << (std::is_integral_v<T> ? "whole number" : "number") << " from " << min << " to "
+              << max;
+      return Bad(message.str());
+    }
+    target = value;
+    return absl::OkStatus();
+  }
+
   CLI::App& app_;
   bool help_ = false;
   std::vector<Entry> entries_;
@@ -200,6 +277,7 @@ class Options {
   std::list<std::string> texts_;                     // stable addresses
   std::list<std::vector<std::string>> value_lists_;  // stable addresses
   std::vector<std::function<absl::Status()>> checks_;
+  std::string* number_ = nullptr;  // the text of PositionalNumber
 };
 
 struct VerbInfo {
@@ -209,27 +287,41 @@ struct VerbInfo {
 };
 constexpr VerbInfo kVerbs[] = {
     {Verb::kRender, "render", "render a scene in this process, on all cores"},
-    {Verb::kSubmit, "submit", "render a scene on a farm, wait for it and stitch the image"},
+    {Verb::kSubmit, "submit", "render a scene on a farm, wait for it and stitch its images"},
     {Verb::kStatus, "status", "what the farm's jobs and workers do"},
-    {Verb::kCancel, "cancel", "cancel a job"},
-    {Verb::kFetch, "fetch", "stitch the image of a job that was submitted before"},
+    {Verb::kWatch, "watch", "follow jobs to their end; without JOB all that have not ended"},
+    {Verb::kFetch, "fetch", "stitch the images of a job that was submitted before"},
+    {Verb::kPause, "pause", "let jobs rest: tiles in work are finished, no new ones start"},
+    {Verb::kResume, "resume", "let paused jobs go on"},
+    {Verb::kCancel, "cancel", "end jobs"},
+    {Verb::kRequeue, "requeue", "let failed or cancelled jobs go on where they were"},
+    {Verb::kPriority, "priority", "change a job's priority; higher goes first"},
+    {Verb::kWorkers, "workers", "the farm's workers"},
+    {Verb::kLogs, "logs", "what happened to a job"},
+    {Verb::kExplain, "explain", "why a job is in the state that it is in"},
     {Verb::kCompare, "compare", "measure how an image differs from a reference"},
 };
 
 constexpr char kOverview[] =
-    "farpoint renders glTF scenes with factorized point-based global illumination.\n"
+    "farpoint renders scenes with factorized point-based global illumination.\n"
     "\n"
     "  farpoint render SCENE -o OUT.exr [flags]\n"
     "  farpoint submit SCENE -o OUT.exr --coordinator HOST:PORT [flags]\n"
-    "  farpoint status [JOB] --coordinator HOST:PORT [--json FILE]\n"
-    "  farpoint cancel JOB --coordinator HOST:PORT\n"
-    "  farpoint fetch JOB -o OUT.exr --coordinator HOST:PORT\n"
+    "  farpoint status [JOB]            jobs and workers\n"
+    "  farpoint watch [JOB...]          follow jobs to their end\n"
+    "  farpoint fetch JOB -o OUT.exr    the images of a job\n"
+    "  farpoint pause | resume | cancel JOB...\n"
+    "  farpoint requeue JOB... [--all]\n"
+    "  farpoint priority JOB N\n"
+    "  farpoint logs JOB [--follow]\n"
+    "  farpoint explain JOB\n"
+    "  farpoint workers\n"
     "  farpoint compare IMAGE REFERENCE [--layer NAME] [--mask FILE] [--json FILE]\n"
     "\n"
     "  farpoint COMMAND --help     the flags of a command\n"
     "  farpoint --version\n"
     "\n"
-    "SCENE is .gltf, .glb or a job file .json. FARPOINT_COORDINATOR stands in for --coordinator.\n"
+    "SCENE is a scene file or a job file .json. FARPOINT_COORDINATOR stands in for --coordinator.\n"
     "Exit codes: 0 done; 2 wrong usage; 42 the scene or the settings are wrong; 75 try again;\n"
     "130, 143 stopped by a signal.\n";
 
@@ -239,6 +331,8 @@ struct Parsed {
   std::optional<double> patience, exposure, noise;
   std::optional<int32_t> priority;
   std::string title;
+  std::string compression = "zip";
+  std::string frames;
   std::string log_level = "info";
   std::string config;
 };
@@ -260,18 +354,28 @@ void DeclareCoordinator(Options& options, CommandLine& line, Parsed& parsed) {
 }
 
 void DeclareImage(Options& options, CommandLine& line, Parsed& parsed) {
-  options.Text("-o,--output", "OUT.exr", line.output, "the image to write", "Output");
+  options.Text("-o,--output", "OUT.exr", line.output,
+               "the image to write; out.####.exr or out.%04d.exr for a sequence", "Output");
+  options.Text("--compression", "NAME", parsed.compression,
+               "of the image: none, rle, zips, zip (the default), piz, or dwaa, which is lossy",
+               "Output");
   options.Text("--png", "FILE", line.png, "an 8-bit sRGB preview too", "Output");
   options.Number<double>("--exposure", "STOPS", parsed.exposure, -64, 64,
                          "exposure of the preview; default 0", "Output");
   options.Text("--json", "FILE", line.json, "statistics; - for stdout", "Output");
 }
 
+// What every command has that asks a coordinator.
+void DeclareFarm(Options& options, CommandLine& line, Parsed& parsed, const std::string& json) {
+  options.Text("--json", "FILE", line.json, json, "Output");
+  DeclareCoordinator(options, line, parsed);
+}
+
 void Declare(Options& options, CommandLine& line, Parsed& parsed) {
   switch (line.verb) {
     case Verb::kRender:
     case Verb::kSubmit:
-      options.Positional("SCENE", line.scene, ".gltf, .glb or a job file .json");
+      options.Positional("SCENE", line.scene, "a scene file or a job file .json");
       DeclareImage(options, line, parsed);
       options.Render(line.render_flags);
       options.Number<uint32_t>("--workers", "N", parsed.workers, 1, 256,
@@ -282,24 +386,63 @@ void Declare(Options& options, CommandLine& line, Parsed& parsed) {
                                "Speed only (no pixel changes)");
       if (line.verb == Verb::kSubmit) {
         DeclareCoordinator(options, line, parsed);
-        options.Flag("--detach", line.detach, "print the job's id and do not wait", "Farm");
+        options.Flag("--detach", line.detach,
+                     "print the job's id and do not wait; farpoint fetch gets the images", "Farm");
         options.Text("--title", "TEXT", parsed.title, "the job's name for people", "Farm");
-        options.Number<int32_t>("--priority", "N", parsed.priority, -1000, 1000,
+        options.Number<int32_t>("--priority", "N", parsed.priority, kMinPriority, kMaxPriority,
                                 "higher goes first; default 0", "Farm");
+        options.List("--after", "JOB[,JOB]", line.after,
+                     "start when these jobs are done; may be repeated", "Farm");
+        options.Flag("--paused", line.paused, "start paused; farpoint resume lets it go", "Farm");
       }
       break;
     case Verb::kStatus:
-      options.Positional("JOB", line.job, "a job's id; default: all jobs and workers");
-      options.Text("--json", "FILE", line.json, "as JSON; - for stdout", "Output");
-      DeclareCoordinator(options, line, parsed);
+      options.Positionals("JOB", line.jobs, "a job's id; default: all jobs and workers");
+      DeclareFarm(options, line, parsed, "as JSON; - for stdout");
       break;
+    case Verb::kWatch:
+      options.Positionals("JOB", line.jobs, "ids of jobs; default: all that have not ended");
+      DeclareFarm(options, line, parsed, "how the jobs ended, as JSON; - for stdout");
+      break;
+    case Verb::kPause:
+    case Verb::kResume:
     case Verb::kCancel:
-      options.Positional("JOB", line.job, "the job's id");
-      DeclareCoordinator(options, line, parsed);
+      options.Positionals("JOB", line.jobs, "ids of jobs");
+      DeclareFarm(options, line, parsed, "the jobs' status afterwards, as JSON; - for stdout");
+      break;
+    case Verb::kRequeue:
+      options.Positionals("JOB", line.jobs, "ids of jobs");
+      options.Flag("--all", line.all, "render every tile again, also of jobs that are done",
+                   "Requeue");
+      DeclareFarm(options, line, parsed, "the jobs' status afterwards, as JSON; - for stdout");
+      break;
+    case Verb::kPriority:
+      options.Positional("JOB", line.jobs.emplace_back(), "the job's id");
+      options.PositionalNumber<int32_t>("N", parsed.priority, kMinPriority, kMaxPriority,
+                                        "its priority, -1000..1000; higher goes first");
+      DeclareFarm(options, line, parsed, "the job's status afterwards, as JSON; - for stdout");
+      break;
+    case Verb::kWorkers:
+      DeclareFarm(options, line, parsed, "as JSON; - for stdout");
+      break;
+    case Verb::kLogs:
+      options.Positionals("JOB", line.jobs, "the job's id");
+      options.Flag("--follow", line.follow, "go on until the job has ended", "Log");
+      DeclareFarm(options, line, parsed, "an object on each line; - for stdout");
+      break;
+    case Verb::kExplain:
+      options.Positionals("JOB", line.jobs, "the job's id");
+      DeclareFarm(options, line, parsed, "as JSON; - for stdout");
       break;
     case Verb::kFetch:
-      options.Positional("JOB", line.job, "the job's id");
+      options.Positionals("JOB", line.jobs, "the job's id");
       DeclareImage(options, line, parsed);
+      options.Text("--frames", "RANGE", parsed.frames,
+                   "only these frames of a sequence, e.g. 1-10x2,15", "Fetch");
+      options.Flag("--partial", line.partial,
+                   "also images of which tiles are missing; those pixels are zero", "Fetch");
+      options.Flag("--wait", line.wait, "wait for the job's end and write frames as they are done",
+                   "Fetch");
       DeclareCoordinator(options, line, parsed);
       break;
     case Verb::kCompare:
@@ -357,6 +500,7 @@ absl::StatusOr<std::vector<std::string>> ReadConfig(const std::string& path,
     }
     if (name == "--config") return Bad(where + ": a configuration file cannot name another one");
     if (!options.IsSwitch(name)) {
+      if (value.empty()) return Bad(where + ": " + name.substr(2) + " needs a value");
       args.push_back(name + "=" + std::string(value));
     } else if (value == "true") {
       args.push_back(name);
@@ -368,6 +512,7 @@ absl::StatusOr<std::vector<std::string>> ReadConfig(const std::string& path,
 }
 
 absl::Status Split(Options& options, std::span<const std::string> args) {
+  FP_RETURN_IF_ERROR(options.CheckValues(args));
   std::vector<std::string> reversed(args.rbegin(), args.rend());
   try {
     options.app().parse(reversed);
@@ -394,36 +539,73 @@ absl::Status CheckCoordinator(const std::string& address) {
   return absl::OkStatus();
 }
 
+absl::Status CheckJobs(const CommandLine& line) {
+  size_t min = 1, max = SIZE_MAX;
+  switch (line.verb) {
+    case Verb::kStatus:
+      min = 0, max = 1;
+      break;
+    case Verb::kWatch:
+      min = 0;
+      break;
+    case Verb::kFetch:
+    case Verb::kPriority:
+    case Verb::kLogs:
+    case Verb::kExplain:
+      max = 1;
+      break;
+    case Verb::kPause:
+    case Verb::kResume:
+    case Verb::kCancel:
+    case Verb::kRequeue:
+      break;
+    default:
+      return absl::OkStatus();
+  }
+  if (line.jobs.size() > max) {
+    return Bad("'" + line.jobs[max] + "' is one argument too many; one JOB at a time");
+  }
+  if (line.jobs.size() < min || (!line.jobs.empty() && line.jobs[0].empty())) {
+    return Bad("JOB: not given; farpoint status lists the jobs");
+  }
+  if (line.verb == Verb::kPriority && !line.priority) {
+    return Bad("N: not given; say the job's priority, -1000..1000");
+  }
+  return absl::OkStatus();
+}
+
 absl::Status CheckNeeds(const CommandLine& line) {
   const bool renders = line.verb == Verb::kRender || line.verb == Verb::kSubmit;
   if (renders) {
     if (line.scene.empty()) {
-      return Bad("SCENE: not given; name a .gltf, .glb or a job file .json");
+      return Bad("SCENE: not given; name a scene file or a job file .json");
     }
     FP_RETURN_IF_ERROR(CheckScenePath(line.scene));
   }
-  const bool writes = (renders && !line.detach) || line.verb == Verb::kFetch;
-  if (writes) {
-    if (line.output.empty()) return Bad("-o: not given; name the image to write, e.g. -o out.exr");
-    if (!line.output.ends_with(".exr")) {
+  if (renders || line.verb == Verb::kFetch) {
+    if (line.output.empty() && !line.detach) {
+      return Bad("-o: not given; name the image to write, e.g. -o out.exr");
+    }
+    if (!line.output.empty() && !line.output.ends_with(".exr")) {
       return Bad("-o " + line.output + ": images are OpenEXR files; end the name in .exr");
     }
     if (!line.png.empty() && !line.png.ends_with(".png")) {
       return Bad("--png " + line.png + ": previews are PNG files; end the name in .png");
     }
   }
-  if (line.detach && !(line.output.empty() && line.png.empty() && line.json.empty())) {
-    return Bad(
-        "--detach: does not wait for an image; leave -o, --png and --json to farpoint fetch");
+  if (line.after.size() > kMaxAfter) {
+    return Bad("--after: names " + std::to_string(line.after.size()) +
+               " jobs; a job can wait for at most " + std::to_string(kMaxAfter));
   }
-  if ((line.verb == Verb::kCancel || line.verb == Verb::kFetch) && line.job.empty()) {
-    return Bad("JOB: not given; farpoint status lists the jobs");
+  if (line.partial && line.wait) {
+    return Bad("--partial: takes what is there now; leave --wait out");
+  }
+  FP_RETURN_IF_ERROR(CheckJobs(line));
+  if (line.verb != Verb::kRender && line.verb != Verb::kCompare) {
+    FP_RETURN_IF_ERROR(CheckCoordinator(line.coordinator));
   }
   if (line.verb == Verb::kCompare && (line.image_a.empty() || line.image_b.empty())) {
     return Bad("IMAGE, REFERENCE: not given; name two .exr files");
-  }
-  if (line.verb != Verb::kRender && line.verb != Verb::kCompare) {
-    FP_RETURN_IF_ERROR(CheckCoordinator(line.coordinator));
   }
   return absl::OkStatus();
 }
@@ -479,6 +661,14 @@ absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
   auto level = ConsoleLevelFromName(parsed.log_level);
   FP_RETURN_IF_ERROR(Annotate(level.status(), "--log-level " + parsed.log_level));
   line.log_level = *level;
+  auto compression = ExrCompressionFromName(parsed.compression);
+  FP_RETURN_IF_ERROR(Annotate(compression.status(), "--compression " + parsed.compression));
+  line.compression = *compression;
+  if (!parsed.frames.empty()) {
+    auto frames = ParseFrameRange(parsed.frames);
+    FP_RETURN_IF_ERROR(Annotate(frames.status(), "--frames " + parsed.frames));
+    line.frames = *std::move(frames);
+  }
   line.farm_ignores = line.verb == Verb::kSubmit && (parsed.workers || parsed.threads);
   line.workers = parsed.workers.value_or(line.workers);
   line.threads = parsed.threads.value_or(line.threads);

@@ -9,10 +9,26 @@
 #include "client/console.h"
 #include "client/render_flags.h"
 #include "core/base/status.h"
+#include "core/image/exr_io.h"
 
 namespace farpoint {
 
-enum class Verb { kRender, kSubmit, kStatus, kCancel, kFetch, kCompare };
+enum class Verb {
+  kRender,
+  kSubmit,
+  kStatus,
+  kWatch,
+  kFetch,
+  kPause,
+  kResume,
+  kCancel,
+  kRequeue,
+  kPriority,
+  kWorkers,
+  kLogs,
+  kExplain,
+  kCompare,
+};
 
 struct CommandLine {
   Verb verb = Verb::kRender;
@@ -31,17 +47,32 @@ struct CommandLine {
   uint32_t workers = 1;       // render: embedded workers
   uint32_t threads = 0;       // render: of each worker; 0: all cores
   bool farm_ignores = false;  // submit was given --workers or --threads
+
+  // submit
   bool detach = false;
+  bool paused = false;
   std::optional<std::string> title;
+  std::vector<std::string> after;  // ids of jobs
+
+  // submit, priority
   std::optional<int32_t> priority;
 
   // render, submit, fetch
   std::string output;  // .exr
   std::string png;     // empty: no preview
   float exposure_stops = 0;
+  ExrCompression compression = ExrCompression::kZip;
 
-  // status, cancel, fetch
-  std::string job;
+  // fetch
+  std::vector<int32_t> frames;  // empty: all
+  bool partial = false;
+  bool wait = false;
+
+  // Ids: status at most one; fetch, priority, logs and explain exactly one; pause, resume, cancel
+  // and requeue at least one; watch any number.
+  std::vector<std::string> jobs;
+  bool all = false;     // requeue
+  bool follow = false;  // logs
 
   // compare
   std::string image_a, image_b;

@@ -2,33 +2,30 @@
 
 #include <unistd.h>
 
+#include <algorithm>
 #include <chrono>
-#include <cstdio>
 #include <filesystem>
+#include <map>
 #include <memory>
-#include <optional>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include "client/embedded_farm.h"
 #include "client/exit_code.h"
+#include "client/farm_commands.h"
+#include "client/frame_range.h"
 #include "client/grpc_farm_link.h"
+#include "client/image_writer.h"
 #include "client/job_request.h"
 #include "client/job_run.h"
 #include "client/reports.h"
 #include "client/retry.h"
-#include "core/base/blob.h"
 #include "core/image/compare.h"
 #include "core/image/exr_io.h"
 
 namespace farpoint {
 namespace {
-
-using SteadyTime = std::chrono::steady_clock::time_point;
-
-double SecondsSince(SteadyTime start) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
 
 // Before hours of work, not after them.
 absl::Status CheckFolderOf(const std::string& file, std::string_view flag) {
@@ -55,118 +52,192 @@ absl::Status CheckOutputs(const CommandLine& line) {
   return CheckFolderOf(line.json, "--json");
 }
 
-absl::Status WriteText(const std::string& file, const std::string& text) {
-  if (file != "-") return WriteFileAtomically(file, std::as_bytes(std::span(text)));
-  if (std::fwrite(text.data(), 1, text.size(), stdout) != text.size() || std::fflush(stdout) != 0) {
-    return absl::UnavailableError("stdout cannot be written");
-  }
-  return absl::OkStatus();
-}
-
-absl::Status WriteImage(const CommandLine& line, const FinishedJob& job, SteadyTime start,
-                        Console& console) {
-  const Digest image_hash = ImageHash(job.film);
-  const FilmSpec& film = job.info.spec.film;
-  FP_RETURN_IF_ERROR(WriteExr(line.output, job.film, film.width, film.height,
-                              ImageMetadata(job.info, image_hash), ExrCompression::kZip));
-  if (!line.png.empty()) {
-    FP_RETURN_IF_ERROR(WritePngPreview(line.png, job.film, line.exposure_stops));
-  }
-  const double run_seconds = SecondsSince(start);
-  if (!line.json.empty()) {
-    Stats stats = job.info.stats;
-    uint64_t& peak_rss = stats.bytes["peak_rss"];
-    peak_rss = std::max(peak_rss, PeakResidentBytes());
-    FP_RETURN_IF_ERROR(
-        WriteText(line.json, StatisticsJson(stats, job.info.blobs, image_hash, run_seconds)));
-  }
-  console.Info("wrote " + line.output + ", " + std::to_string(film.crop.width()) + "x" +
-               std::to_string(film.crop.height()) + ", in " + DurationText(run_seconds) +
-               ", image hash " + image_hash.Hex());
-  return absl::OkStatus();
-}
-
 Retry MakeRetry(const CommandLine& line, const StopFlag& stop, Console& console) {
   RetryPolicy policy;
   policy.patience = std::chrono::milliseconds(static_cast<int64_t>(line.patience_s * 1000));
   return Retry(policy, "coordinator " + line.coordinator, stop, console);
 }
 
+absl::StatusOr<ImageWriter> MakeWriter(const CommandLine& line, Console& console) {
+  return ImageWriter::Create({.exr = line.output,
+                              .png = line.png,
+                              .json = line.json,
+                              .exposure_stops = line.exposure_stops,
+                              .compression = line.compression},
+                             std::chrono::steady_clock::now(), console);
+}
+
+FrameSink SinkOf(ImageWriter& writer) {
+  return [&writer](const JobInfo& info, const FetchedFrame& frame) {
+    return writer.Write(info, frame);
+  };
+}
+
+// The numbers of the frames that are not written, as --frames takes them.
+std::string FramesLeft(const JobSpec& spec, const ImageWriter& writer) {
+  std::vector<int32_t> left = spec.frames;
+  for (const FrameReport& frame : writer.written()) std::erase(left, frame.number);
+  return FrameRangeText(left);
+}
+
+// The command that gets what this one asked for.
+std::string FetchCommand(const CommandLine& line, const JobId& job) {
+  std::string command = "farpoint fetch " + job.value + " -o ";
+  command += line.output.empty() ? "OUT.exr" : line.output;
+  if (!line.png.empty()) command += " --png " + line.png;
+  if (line.compression != ExrCompression::kZip) {
+    command.append(" --compression ").append(NameOf(line.compression));
+  }
+  return command + " --coordinator " + line.coordinator;
+}
+
 absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& console,
                     bool& usage_error) {
-  const SteadyTime start = std::chrono::steady_clock::now();
   FP_RETURN_IF_ERROR(CheckOutputs(line));
+  usage_error = true;
+  FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   FP_ASSIGN_OR_RETURN(const PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
+  const JobSpec& spec = request.spec;
+  usage_error = true;
+  FP_RETURN_IF_ERROR(writer.CheckNames(spec.frame_count(), !spec.frames.empty()));
+  usage_error = false;
   FP_ASSIGN_OR_RETURN(
       const std::unique_ptr<FarmLink> farm,
-      StartEmbeddedFarm({.workers = line.workers, .threads = line.threads}, stop, console));
+      StartEmbeddedFarm(
+          {.workers = line.workers, .threads = line.threads, .on_disk = spec.frame_count() > 1},
+          stop, console));
   // Nothing is between this and the coordinator: one attempt says all.
   Retry once({.patience = std::chrono::milliseconds(0)}, "the embedded coordinator", stop, console);
   JobRun run(*farm, once, stop, console);
   FP_ASSIGN_OR_RETURN(const JobId id, run.Submit(request));
-  const absl::Status outcome = run.Wait(id);
-  if (absl::IsCancelled(outcome)) farm->Cancel(id).IgnoreError();
+  const absl::Status outcome = run.Wait(id, SinkOf(writer));
+  if (stop.raised()) {
+    farm->Cancel(id).IgnoreError();
+    if (!writer.written().empty()) {
+      console.Info("the frames that were written are whole; --frames " + FramesLeft(spec, writer) +
+                   " renders the others");
+    }
+  }
   FP_RETURN_IF_ERROR(outcome);
-  FP_ASSIGN_OR_RETURN(const FinishedJob job, run.Fetch(id));
-  return WriteImage(line, job, start, console);
+  return writer.WriteStatistics();
 }
 
 absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& console,
                     bool& usage_error) {
-  const SteadyTime start = std::chrono::steady_clock::now();
   FP_RETURN_IF_ERROR(CheckOutputs(line));
   if (line.farm_ignores) {
     console.Info("--workers and --threads say nothing to a farm: its workers have their own");
   }
+  usage_error = true;
+  FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   FP_ASSIGN_OR_RETURN(PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
-  if (line.title) request.spec.title = *line.title;
-  if (line.priority) request.spec.priority = *line.priority;
+  JobSpec& spec = request.spec;
+  if (line.title) spec.title = *line.title;
+  if (line.priority) spec.priority = *line.priority;
+  for (const std::string& id : line.after) spec.after.push_back(JobId{id});
+  if (line.paused) spec.start_paused = true;
+  usage_error = true;
+  if (!line.output.empty()) {
+    FP_RETURN_IF_ERROR(writer.CheckNames(spec.frame_count(), !spec.frames.empty()));
+  }
+  usage_error = false;
   const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
   FP_ASSIGN_OR_RETURN(const JobId id, run.Submit(request));
-  if (line.detach) return WriteText("-", id.value + "\n");
+  if (line.detach) {
+    console.Info("job " + id.value + " is on its way; " + FetchCommand(line, id) +
+                 (spec.frames.empty() ? " gets its image" : " gets its images"));
+    if (!line.json.empty()) {
+      FP_ASSIGN_OR_RETURN(const FarmStatus status,
+                          retry.Get<FarmStatus>([&] { return farm->Status(id); }));
+      if (status.jobs.size() == 1) {
+        FP_RETURN_IF_ERROR(WriteText(line.json, JobStatusJson(status.jobs[0])));
+      }
+    }
+    // A stdout that carries JSON carries nothing else.
+    return line.json == "-" ? absl::OkStatus() : WriteText("-", id.value + "\n");
+  }
   console.Info("job " + id.value);
-  const absl::Status outcome = run.Wait(id);
+  const absl::Status outcome = run.Wait(id, SinkOf(writer));
   if (stop.raised()) {
-    console.Info("job " + id.value + " goes on; farpoint fetch " + id.value +
-                 " gets its image, farpoint cancel " + id.value + " ends it");
+    std::string command = FetchCommand(line, id);
+    if (!writer.written().empty()) command += " --frames " + FramesLeft(spec, writer);
+    console.Info("job " + id.value + " goes on; " + command +
+                 " gets what is left, farpoint cancel " + id.value + " ends it");
   }
   FP_RETURN_IF_ERROR(outcome);
-  FP_ASSIGN_OR_RETURN(const FinishedJob job, run.Fetch(id));
-  return WriteImage(line, job, start, console);
+  return writer.WriteStatistics();
 }
 
-absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& console) {
-  const SteadyTime start = std::chrono::steady_clock::now();
+// The indices of the frames that the line names.
+absl::StatusOr<std::vector<uint32_t>> FramesWanted(const CommandLine& line, const JobInfo& info) {
+  std::vector<uint32_t> indices;
+  if (line.frames.empty()) {
+    for (uint32_t i = 0; i < info.frames.size(); ++i) indices.push_back(i);
+    return indices;
+  }
+  if (info.spec.frames.empty()) {
+    return absl::InvalidArgumentError("--frames: job " + info.status.id.value +
+                                      " is a still; leave the flag out");
+  }
+  std::map<int32_t, uint32_t> index_of;
+  for (uint32_t i = 0; i < info.frames.size(); ++i) index_of[info.frames[i].number] = i;
+  for (const int32_t frame : line.frames) {
+    const auto found = index_of.find(frame);
+    if (found == index_of.end()) {
+      return absl::InvalidArgumentError("--frames: job " + info.status.id.value + " has no frame " +
+                                        std::to_string(frame) + "; it has " +
+                                        FrameRangeText(info.spec.frames));
+    }
+    indices.push_back(found->second);
+  }
+  return indices;
+}
+
+absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& console,
+                   bool& usage_error) {
   FP_RETURN_IF_ERROR(CheckOutputs(line));
+  usage_error = true;
+  FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
+  usage_error = false;
   const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
-  FP_ASSIGN_OR_RETURN(const FinishedJob job, run.Fetch(JobId{line.job}));
-  return WriteImage(line, job, start, console);
-}
+  const JobId id{line.jobs[0]};
+  FP_ASSIGN_OR_RETURN(JobInfo info, run.Info(id));
+  usage_error = true;
+  FP_ASSIGN_OR_RETURN(const std::vector<uint32_t> wanted, FramesWanted(line, info));
+  FP_RETURN_IF_ERROR(writer.CheckNames(wanted.size(), !info.spec.frames.empty()));
+  usage_error = false;
 
-absl::Status Status(const CommandLine& line, const StopFlag& stop, Console& console) {
-  FP_RETURN_IF_ERROR(CheckOutputs(line));
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
-  Retry retry = MakeRetry(line, stop, console);
-  FP_ASSIGN_OR_RETURN(const FarmStatus status,
-                      retry.Get<FarmStatus>([&] { return farm->Status(JobId{line.job}); }));
-  if (line.json.empty()) return WriteText("-", FarmStatusText(status));
-  if (line.job.empty()) return WriteText(line.json, FarmStatusJson(status));
-  if (status.jobs.size() != 1) {
-    return absl::InternalError("the coordinator says nothing about job " + line.job);
+  if (line.wait && !IsFinal(info.status.state)) {
+    // Frame by frame if all are wanted, else together at the end.
+    const bool all = line.frames.empty();
+    const absl::Status outcome = run.Wait(id, all ? SinkOf(writer) : FrameSink());
+    if (stop.raised()) return outcome;
+    if (all) {
+      FP_RETURN_IF_ERROR(outcome);
+      return writer.WriteStatistics();
+    }
+    FP_ASSIGN_OR_RETURN(info, run.Info(id));
   }
-  return WriteText(line.json, JobStatusJson(status.jobs[0]));
-}
-
-absl::Status Cancel(const CommandLine& line, const StopFlag& stop, Console& console) {
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
-  Retry retry = MakeRetry(line, stop, console);
-  return retry.Run([&] { return farm->Cancel(JobId{line.job}); });
+  FP_ASSIGN_OR_RETURN(const size_t fetched, run.Fetch(info, wanted, line.partial, SinkOf(writer)));
+  if (fetched > 0) FP_RETURN_IF_ERROR(writer.WriteStatistics());
+  const auto whole =
+      std::count_if(writer.written().begin(), writer.written().end(),
+                    [](const FrameReport& frame) { return frame.missing_tiles == 0; });
+  if (static_cast<size_t>(whole) == wanted.size()) return absl::OkStatus();
+  if (line.partial && fetched > 0) return absl::OkStatus();
+  absl::Status outcome = OutcomeOf(info.status);
+  if (outcome.ok()) {
+    outcome = absl::InternalError("job " + id.value + " is done, but tiles of it are missing");
+  }
+  if (info.spec.frames.empty()) return outcome;
+  return Annotate(outcome, std::to_string(whole) + " of " + std::to_string(wanted.size()) +
+                               " frames are written");
 }
 
 absl::Status Compare(const CommandLine& line) {
@@ -188,6 +259,27 @@ absl::Status Compare(const CommandLine& line) {
   return WriteText("-", ComparisonText(result));
 }
 
+absl::Status AskFarm(const CommandLine& line, const StopFlag& stop, Console& console) {
+  FP_RETURN_IF_ERROR(CheckOutputs(line));
+  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
+  Retry retry = MakeRetry(line, stop, console);
+  const FarmSession session{line, *farm, retry, stop, console};
+  switch (line.verb) {
+    case Verb::kStatus:
+      return RunStatus(session);
+    case Verb::kWorkers:
+      return RunWorkers(session);
+    case Verb::kWatch:
+      return RunWatch(session);
+    case Verb::kLogs:
+      return RunLogs(session);
+    case Verb::kExplain:
+      return RunExplain(session);
+    default:
+      return RunControl(session);
+  }
+}
+
 }  // namespace
 
 int RunCommand(const CommandLine& line, const StopFlag& stop, Console& console) {
@@ -200,17 +292,14 @@ int RunCommand(const CommandLine& line, const StopFlag& stop, Console& console) 
     case Verb::kSubmit:
       status = Submit(line, stop, console, usage_error);
       break;
-    case Verb::kStatus:
-      status = Status(line, stop, console);
-      break;
-    case Verb::kCancel:
-      status = Cancel(line, stop, console);
-      break;
     case Verb::kFetch:
-      status = Fetch(line, stop, console);
+      status = Fetch(line, stop, console, usage_error);
       break;
     case Verb::kCompare:
       status = Compare(line);
+      break;
+    default:
+      status = AskFarm(line, stop, console);
       break;
   }
   if (status.ok()) return kExitOk;

@@ -30,7 +30,8 @@ std::string DurationText(double seconds) {
 }
 
 std::string ProgressText(const JobStatus& status, int columns) {
-  if (status.state == JobState::kQueued || status.state == JobState::kBaking) {
+  if (status.state == JobState::kQueued || status.state == JobState::kBaking ||
+      (status.state == JobState::kPaused && status.tiles.committed == 0)) {
     return std::string(NameOf(status.state));
   }
   const double fraction = std::clamp(status.progress, 0.0, 1.0);
@@ -39,6 +40,11 @@ std::string ProgressText(const JobStatus& status, int columns) {
   std::string tail = percent;
   tail.append("  ").append(std::to_string(status.tiles.committed));
   tail.append("/").append(std::to_string(status.tiles.total)).append(" tiles");
+  if (status.frames.total > 1) {
+    tail.append("  ").append(std::to_string(status.frames.done));
+    tail.append("/").append(std::to_string(status.frames.total)).append(" frames");
+  }
+  if (status.state == JobState::kPaused) tail += "  paused";
   if (status.reissued > 0) tail += "  " + std::to_string(status.reissued) + " again";
   if (status.eta_s && !IsFinal(status.state)) tail += "  eta " + DurationText(*status.eta_s);
   const int width = std::min(40, columns - static_cast<int>(tail.size()) - 5);
@@ -48,6 +54,32 @@ std::string ProgressText(const JobStatus& status, int columns) {
   bar.append(full, '#').append(width - full, '-').append("] ").append(tail);
   return bar;
 }
+
+namespace {
+
+// Changes when the state does or another tenth is done.
+std::string TenthOf(const JobStatus& status) {
+  std::string report(NameOf(status.state));
+  if (status.state == JobState::kRendering) {
+    report += " " + std::to_string(static_cast<int>(status.progress * 10));
+  }
+  return report;
+}
+
+std::string StateText(const JobStatus& status) {
+  std::string text(NameOf(status.state));
+  if (status.tiles.total > 0) {
+    text += ", " + std::to_string(status.tiles.committed) + " of " +
+            std::to_string(status.tiles.total) + " tiles";
+  }
+  if (status.frames.total > 1) {
+    text += ", " + std::to_string(status.frames.done) + " of " +
+            std::to_string(status.frames.total) + " frames";
+  }
+  return text;
+}
+
+}  // namespace
 
 Console::Console(std::FILE* stream, bool terminal, ConsoleLevel level, bool quiet)
     : stream_(stream), terminal_(terminal), level_(level), quiet_(quiet) {}
@@ -78,23 +110,24 @@ void Console::Progress(const JobStatus& status) {
     std::fwrite(line.data(), 1, line.size(), stream_);
     bar_drawn_ = true;
   } else {
-    // A line when the state changes or another tenth is done.
-    std::string report(NameOf(status.state));
-    if (status.state == JobState::kRendering) {
-      report += " " + std::to_string(static_cast<int>(status.progress * 10));
-    }
+    const std::string report = TenthOf(status);
     if (report == last_report_) return;
     last_report_ = report;
-    std::string line = "farpoint: ";
-    line.append(NameOf(status.state));
-    if (status.tiles.total > 0) {
-      line.append(", ").append(std::to_string(status.tiles.committed)).append(" of ");
-      line.append(std::to_string(status.tiles.total)).append(" tiles");
-    }
-    line.append("\n");
+    const std::string line = "farpoint: " + StateText(status) + "\n";
     std::fwrite(line.data(), 1, line.size(), stream_);
   }
   std::fflush(stream_);
+}
+
+void Console::Report(const JobStatus& status) {
+  {
+    std::lock_guard lock(mutex_);
+    std::string& last = last_reports_[status.id];
+    const std::string report = TenthOf(status);
+    if (report == last) return;
+    last = report;
+  }
+  Info("job " + status.id.value + " " + StateText(status));
 }
 
 }  // namespace farpoint

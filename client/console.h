@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdio>
+#include <map>
 #include <mutex>
 #include <string>
 #include <string_view>
@@ -33,6 +34,8 @@ class Console {
   void Error(std::string_view text) { Write(ConsoleLevel::kError, "error: ", text); }
 
   void Progress(const JobStatus& status);
+  // Of one of several jobs: a line with its id when something changed that is worth one.
+  void Report(const JobStatus& status);
 
  private:
   void Write(ConsoleLevel level, std::string_view prefix, std::string_view text);
@@ -43,8 +46,9 @@ class Console {
   const ConsoleLevel level_;
   const bool quiet_;
   std::mutex mutex_;
-  bool bar_drawn_ = false;   // guarded by mutex_
-  std::string last_report_;  // guarded by mutex_
+  bool bar_drawn_ = false;                     // guarded by mutex_
+  std::string last_report_;                    // guarded by mutex_
+  std::map<JobId, std::string> last_reports_;  // guarded by mutex_
 };
 
 }  // namespace farpoint

@@ -2,6 +2,8 @@
 
 #include <atomic>
 #include <chrono>
+#include <cstdlib>
+#include <filesystem>
 #include <string>
 #include <thread>
 #include <utility>
@@ -29,11 +31,43 @@ void Show(Console& console, bool warning, bool error, std::string_view text) {
   }
 }
 
+// A folder of its own that goes with this.
+class TemporaryFolder {
+ public:
+  static absl::StatusOr<TemporaryFolder> Create() {
+    std::error_code error;
+    const std::filesystem::path base = std::filesystem::temp_directory_path(error);
+    std::string path = (base / "farpoint-XXXXXX").string();
+    if (error || mkdtemp(path.data()) == nullptr) {
+      return absl::UnavailableError("cannot make a folder among the temporary files, " + path +
+                                    "; let TMPDIR name a folder that can be written");
+    }
+    return TemporaryFolder(std::move(path));
+  }
+  TemporaryFolder() = default;
+  TemporaryFolder(TemporaryFolder&& from) noexcept : path_(std::exchange(from.path_, {})) {}
+  TemporaryFolder& operator=(TemporaryFolder&& from) noexcept {
+    std::swap(path_, from.path_);
+    return *this;
+  }
+  ~TemporaryFolder() {
+    std::error_code ignored;
+    if (!path_.empty()) std::filesystem::remove_all(path_, ignored);
+  }
+  const std::string& path() const { return path_; }
+
+ private:
+  explicit TemporaryFolder(std::string path) : path_(std::move(path)) {}
+
+  std::string path_;
+};
+
 class EmbeddedFarm final : public FarmLink {
  public:
-  EmbeddedFarm(std::unique_ptr<Coordinator> coordinator, const EmbeddedFarmOptions& options,
-               const StopFlag& stop, Console& console)
+  EmbeddedFarm(TemporaryFolder folder, std::unique_ptr<Coordinator> coordinator,
+               const EmbeddedFarmOptions& options, const StopFlag& stop, Console& console)
       : stop_(stop),
+        folder_(std::move(folder)),
         coordinator_(std::move(coordinator)),
         link_(*coordinator_),
         renderer_(MakeCoreRenderer()) {
@@ -87,15 +121,27 @@ class EmbeddedFarm final : public FarmLink {
   }
   absl::Status Cancel(const JobId& job) override { return coordinator_->Cancel(job); }
 
+  absl::Status Pause(const JobId& job) override { return coordinator_->Pause(job); }
+  absl::Status Resume(const JobId& job) override { return coordinator_->Resume(job); }
+  absl::Status SetPriority(const JobId& job, int32_t priority) override {
+    return coordinator_->SetPriority(job, priority);
+  }
+  absl::Status Requeue(const JobId& job, bool all) override {
+    return coordinator_->Requeue(job, all);
+  }
+  absl::StatusOr<Explanation> Explain(const JobId& job) override {
+    return coordinator_->Explain(job);
+  }
+
   absl::Status Watch(const JobId& job, uint64_t after_sequence,
-                     const std::function<void(const JobEvent&)>& on_event) override {
+                     const std::function<absl::Status(const JobEvent&)>& on_event) override {
     while (true) {
       FP_ASSIGN_OR_RETURN(const std::vector<JobEvent> events,
                           coordinator_->NextEvents(job, after_sequence, kEventWait));
       if (events.empty()) return absl::OkStatus();
       for (const JobEvent& event : events) {
-        on_event(event);
         if (event.sequence > 0) after_sequence = event.sequence;
+        FP_RETURN_IF_ERROR(on_event(event));
       }
       if (stop_.raised()) return absl::CancelledError("stopped by a signal");
     }
@@ -116,6 +162,7 @@ class EmbeddedFarm final : public FarmLink {
  private:
   const StopFlag& stop_;
   std::atomic<bool> ending_{false};
+  TemporaryFolder folder_;  // outlives the coordinator
   std::unique_ptr<Coordinator> coordinator_;
   InProcessLink<CoordinatorApi> link_;
   std::unique_ptr<TileRenderer> renderer_;
@@ -129,6 +176,11 @@ absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOp
                                                             const StopFlag& stop,
                                                             Console& console) {
   CoordinatorOptions coordinator_options;
+  TemporaryFolder folder;
+  if (options.on_disk) {
+    FP_ASSIGN_OR_RETURN(folder, TemporaryFolder::Create());
+    coordinator_options.store_directory = folder.path();
+  }
   coordinator_options.baker = MakeCoreBaker(options.threads);
   // Workers of one process do not vanish, and none is faster than another.
   coordinator_options.silence_time = std::chrono::hours(24);
@@ -140,7 +192,8 @@ absl::StatusOr<std::unique_ptr<FarmLink>> StartEmbeddedFarm(const EmbeddedFarmOp
   };
   FP_ASSIGN_OR_RETURN(std::unique_ptr<Coordinator> coordinator,
                       Coordinator::Open(std::move(coordinator_options)));
-  return std::make_unique<EmbeddedFarm>(std::move(coordinator), options, stop, console);
+  return std::make_unique<EmbeddedFarm>(std::move(folder), std::move(coordinator), options, stop,
+                                        console);
 }
 
 }  // namespace farpoint

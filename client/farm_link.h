@@ -36,11 +36,18 @@ class FarmLink {
 
   // An empty id: all jobs and workers. kNotFound for an unknown one.
   virtual absl::StatusOr<FarmStatus> Status(const JobId& job) = 0;
+  // What a repeated call does stands in server/coordinator.h: nothing more than the first one.
   virtual absl::Status Cancel(const JobId& job) = 0;
+  virtual absl::Status Pause(const JobId& job) = 0;
+  virtual absl::Status Resume(const JobId& job) = 0;
+  virtual absl::Status SetPriority(const JobId& job, int32_t priority) = 0;
+  virtual absl::Status Requeue(const JobId& job, bool all) = 0;
+  virtual absl::StatusOr<Explanation> Explain(const JobId& job) = 0;
 
-  // Calls `on_event` with every event after `after_sequence`, in order, until the job has ended.
+  // Calls `on_event` with every event after `after_sequence`, in order, until the job has ended. An
+  // error of `on_event` ends the call and is returned.
   virtual absl::Status Watch(const JobId& job, uint64_t after_sequence,
-                             const std::function<void(const JobEvent&)>& on_event) = 0;
+                             const std::function<absl::Status(const JobEvent&)>& on_event) = 0;
 
   virtual absl::StatusOr<JobInfo> Info(const JobId& job) = 0;
 

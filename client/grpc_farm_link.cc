@@ -1,10 +1,12 @@
 #include "client/grpc_farm_link.h"
 
+#include <grpc/support/log.h>
 #include <grpcpp/grpcpp.h>
 
 #include <algorithm>
 #include <chrono>
 #include <condition_variable>
+#include <cstdlib>
 #include <mutex>
 #include <thread>
 #include <utility>
@@ -40,6 +42,18 @@ grpc::ChannelArguments ChannelArguments() {
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
   arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
   return arguments;
+}
+
+// What the library writes to stderr on its own says nothing that a call's status does not say, and
+// would stand in front of our error's one line. Who asks for it by GRPC_VERBOSITY gets it.
+void SilenceLibrary() {
+  static const bool silenced = [] {
+    if (std::getenv("GRPC_VERBOSITY") == nullptr) {
+      gpr_set_log_function([](gpr_log_func_args*) {});
+    }
+    return true;
+  }();
+  static_cast<void>(silenced);
 }
 
 absl::Status Damaged(std::string text) {
@@ -159,8 +173,51 @@ class GrpcFarmLink final : public FarmLink {
     return FromGrpc(jobs_->Cancel(call.context(), request, &response));
   }
 
+  absl::Status Pause(const JobId& job) override {
+    Call call(kControlDeadline, stop_);
+    v1::PauseRequest request;
+    request.set_job_id(job.value);
+    v1::PauseResponse response;
+    return FromGrpc(jobs_->Pause(call.context(), request, &response));
+  }
+
+  absl::Status Resume(const JobId& job) override {
+    Call call(kControlDeadline, stop_);
+    v1::ResumeRequest request;
+    request.set_job_id(job.value);
+    v1::ResumeResponse response;
+    return FromGrpc(jobs_->Resume(call.context(), request, &response));
+  }
+
+  absl::Status SetPriority(const JobId& job, int32_t priority) override {
+    Call call(kControlDeadline, stop_);
+    v1::SetPriorityRequest request;
+    request.set_job_id(job.value);
+    request.set_priority(priority);
+    v1::SetPriorityResponse response;
+    return FromGrpc(jobs_->SetPriority(call.context(), request, &response));
+  }
+
+  absl::Status Requeue(const JobId& job, bool all) override {
+    Call call(kControlDeadline, stop_);
+    v1::RequeueRequest request;
+    request.set_job_id(job.value);
+    request.set_all(all);
+    v1::RequeueResponse response;
+    return FromGrpc(jobs_->Requeue(call.context(), request, &response));
+  }
+
+  absl::StatusOr<Explanation> Explain(const JobId& job) override {
+    Call call(kControlDeadline, stop_);
+    v1::ExplainRequest request;
+    request.set_job_id(job.value);
+    v1::ExplainResponse response;
+    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Explain(call.context(), request, &response)));
+    return Explanation{{response.lines().begin(), response.lines().end()}};
+  }
+
   absl::Status Watch(const JobId& job, uint64_t after_sequence,
-                     const std::function<void(const JobEvent&)>& on_event) override {
+                     const std::function<absl::Status(const JobEvent&)>& on_event) override {
     Call call(kWatchDeadline, stop_);
     v1::WatchRequest request;
     request.set_job_id(job.value);
@@ -169,14 +226,16 @@ class GrpcFarmLink final : public FarmLink {
     v1::JobEvent wire;
     while (reader->Read(&wire)) {
       const absl::StatusOr<JobEvent> event = JobEventFromWire(wire);
-      if (!event.ok()) {
+      const absl::Status status =
+          event.ok() ? on_event(*event)
+                     : Annotate(event.status(), "the coordinator's event cannot be read");
+      if (!status.ok()) {
         call.context()->TryCancel();
         while (reader->Read(&wire)) {
         }
         reader->Finish().ok();
-        return Annotate(event.status(), "the coordinator's event cannot be read");
+        return status;
       }
-      on_event(*event);
     }
     return FromGrpc(reader->Finish());
   }
@@ -257,6 +316,7 @@ class GrpcFarmLink final : public FarmLink {
 }  // namespace
 
 std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop) {
+  SilenceLibrary();
   return std::make_unique<GrpcFarmLink>(address, stop);
 }
 

@@ -4,12 +4,14 @@
 #include <utility>
 
 #include "core/base/blob.h"
+#include "core/scene/environment_image.h"
 #include "proto/convert.h"
 
 namespace farpoint {
 namespace {
 
 constexpr size_t kMaxJobFileBytes = size_t{16} << 20;
+constexpr size_t kMaxEnvironmentBytes = size_t{2} << 30;
 
 struct JobFile {
   std::string asset_path;
@@ -43,7 +45,29 @@ absl::StatusOr<JobFile> ReadJobFile(const std::string& path) {
   auto spec = JobFromWire(wire);
   FP_RETURN_IF_ERROR(Annotate(spec.status(), path));
   file.spec = *std::move(spec);
+  if (auto& environment = file.spec.overrides.environment) {
+    environment->uri = (std::filesystem::path(path).parent_path() / environment->uri).string();
+  }
   return file;
+}
+
+// Reads the file at the path that is the environment's uri until now, and gives it a name among the
+// asset's files that says nothing of this machine's folders.
+absl::Status AddEnvironment(EnvironmentOverride& environment, AssetBundle& asset) {
+  const std::string context = "environment map " + environment.uri;
+  auto file = ReadFile(environment.uri, kMaxEnvironmentBytes);
+  FP_RETURN_IF_ERROR(Annotate(file.status(), context));
+  // Hours may lie between this and the coordinator's reading.
+  Environment decoded;
+  FP_RETURN_IF_ERROR(LoadEnvironmentMap(*file, environment.uri, decoded));
+  std::string uri = "env/" + std::filesystem::path(environment.uri).filename().string();
+  const auto there = asset.files.find(uri);
+  if (there != asset.files.end() && there->second.Hash() != file->Hash()) {
+    uri = "env/" + file->Hash().Hex() + std::filesystem::path(environment.uri).extension().string();
+  }
+  asset.files[uri] = *std::move(file);
+  environment.uri = uri;
+  return absl::OkStatus();
 }
 
 v1::RenderJob ImageJob(JobSpec spec) {
@@ -52,6 +76,10 @@ v1::RenderJob ImageJob(JobSpec spec) {
   spec.settings.no_skip = defaults.no_skip;
   spec.title.clear();
   spec.priority = 0;
+  spec.after.clear();
+  spec.start_paused = false;
+  // Of no effect on a still.
+  if (spec.frames.empty()) spec.fps = JobSpec().fps;
   v1::RenderJob wire = ToWire(spec);
   wire.clear_limits();
   wire.mutable_settings()->clear_tile_px();
@@ -77,6 +105,9 @@ absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
 
   PreparedRequest request{.spec = std::move(file.spec)};
   FP_ASSIGN_OR_RETURN(request.asset, CollectAsset(file.asset_path));
+  if (request.spec.overrides.environment) {
+    FP_RETURN_IF_ERROR(AddEnvironment(*request.spec.overrides.environment, request.asset));
+  }
   request.spec.asset_root = request.asset.root;
   request.spec.asset_files.clear();
   for (const auto& [uri, blob] : request.asset.files) {
@@ -84,6 +115,12 @@ absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
   }
   FP_RETURN_IF_ERROR(Annotate(ValidateJob(request.spec), scene));
   return request;
+}
+
+JobSpec SpecOfFrame(const JobSpec& spec, uint32_t frame) {
+  JobSpec one = spec;
+  if (!spec.frames.empty()) one.frames = {spec.frames[frame]};
+  return one;
 }
 
 std::string ImageSettingsJson(const JobSpec& spec) { return RenderJobToJson(ImageJob(spec)); }

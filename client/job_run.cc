@@ -1,6 +1,7 @@
 #include "client/job_run.h"
 
 #include <algorithm>
+#include <chrono>
 #include <cstdio>
 #include <map>
 #include <random>
@@ -16,6 +17,12 @@ constexpr size_t kDigestsPerQuestion = 4096;
 // Bounds what one call may take and what is lost if it breaks.
 constexpr size_t kTilesPerCall = 32;
 constexpr int kFetchRounds = 4;
+// JobInfo grows with the number of frames. Between two questions for it lies at least this many
+// times what the last one took, so that asking stays cheap.
+constexpr int kInfoPause = 10;
+constexpr std::chrono::seconds kLongestPause(10);
+
+using SteadyTime = std::chrono::steady_clock::time_point;
 
 std::string RandomId() {
   std::random_device entropy;
@@ -48,6 +55,9 @@ absl::Status OutcomeOf(const JobStatus& status) {
     case JobState::kCancelled:
       return absl::CancelledError("job " + status.id.value +
                                   " was cancelled; submit it again to render it");
+    case JobState::kPaused:
+      return absl::UnavailableError("job " + status.id.value + " is paused; farpoint resume " +
+                                    status.id.value + " lets it go on");
     default:
       return absl::UnavailableError("job " + status.id.value + " is not done, it is " +
                                     std::string(NameOf(status.state)) +
@@ -89,18 +99,39 @@ absl::StatusOr<JobId> JobRun::Submit(const PreparedRequest& request) {
   return retry_.Get<JobId>([&] { return link_.Submit(request.spec, submission_id); });
 }
 
-absl::Status JobRun::Wait(const JobId& job) {
+absl::Status JobRun::Wait(const JobId& job, const FrameSink& sink) {
   uint64_t last_sequence = 0;
   JobStatus last;
-  FP_RETURN_IF_ERROR(retry_.Run([&] {
-    return link_.Watch(job, last_sequence, [&](const JobEvent& event) {
-      retry_.Succeeded();
-      if (event.sequence > 0) last_sequence = event.sequence;
-      last = event.status;
-      if (const auto* note = std::get_if<std::string>(&event.body)) console_.Info(*note);
-      console_.Progress(event.status);
+  std::vector<bool> taken;
+  size_t taken_count = 0;
+  SteadyTime next_take = SteadyTime::min();
+  while (true) {
+    bool take = false;
+    const absl::Status watched = retry_.Run([&] {
+      take = false;
+      return link_.Watch(job, last_sequence, [&](const JobEvent& event) -> absl::Status {
+        retry_.Succeeded();
+        if (event.sequence > 0) last_sequence = event.sequence;
+        last = event.status;
+        if (const auto* note = std::get_if<std::string>(&event.body)) console_.Info(*note);
+        console_.Progress(event.status);
+        // The last frame's tiles are fetched when the job has ended.
+        take = sink != nullptr && !IsFinal(last.state) && last.frames.done > taken_count &&
+               std::chrono::steady_clock::now() >= next_take;
+        return take ? absl::AbortedError("frames are to be fetched") : absl::OkStatus();
+      });
     });
-  }));
+    if (!take) {
+      FP_RETURN_IF_ERROR(watched);
+      break;
+    }
+    const SteadyTime start = std::chrono::steady_clock::now();
+    FP_ASSIGN_OR_RETURN(const JobInfo info, Info(job));
+    next_take = std::chrono::steady_clock::now();
+    next_take += std::min<SteadyTime::duration>((next_take - start) * kInfoPause, kLongestPause);
+    FP_RETURN_IF_ERROR(TakeComplete(info, taken, sink));
+    taken_count = static_cast<size_t>(std::count(taken.begin(), taken.end(), true));
+  }
   if (!IsFinal(last.state)) {
     // The events ended before the one that says so: ask.
     FP_ASSIGN_OR_RETURN(const FarmStatus status,
@@ -110,13 +141,44 @@ absl::Status JobRun::Wait(const JobId& job) {
     }
     last = status.jobs[0];
   }
+  if (sink != nullptr && last.frames.done > taken_count) {
+    FP_ASSIGN_OR_RETURN(const JobInfo info, Info(job));
+    FP_RETURN_IF_ERROR(TakeComplete(info, taken, sink));
+  }
   return OutcomeOf(last);
 }
 
-absl::StatusOr<FinishedJob> JobRun::Fetch(const JobId& job) {
-  FP_ASSIGN_OR_RETURN(JobInfo info, retry_.Get<JobInfo>([&] { return link_.Info(job); }));
-  FP_RETURN_IF_ERROR(OutcomeOf(info.status));
-  FP_ASSIGN_OR_RETURN(Stitcher stitcher, Stitcher::Create(info));
+absl::StatusOr<JobInfo> JobRun::Info(const JobId& job) {
+  return retry_.Get<JobInfo>([&] { return link_.Info(job); });
+}
+
+absl::Status JobRun::TakeComplete(const JobInfo& info, std::vector<bool>& taken,
+                                  const FrameSink& sink) {
+  taken.resize(info.frames.size(), false);
+  for (uint32_t frame = 0; frame < info.frames.size(); ++frame) {
+    if (taken[frame] || !TilesOfFrame(info, frame).complete()) continue;
+    FP_RETURN_IF_ERROR(FetchFrame(info, frame, false, sink));
+    taken[frame] = true;
+  }
+  return absl::OkStatus();
+}
+
+absl::StatusOr<size_t> JobRun::Fetch(const JobInfo& info, std::span<const uint32_t> frames,
+                                     bool partial, const FrameSink& sink) {
+  size_t fetched = 0;
+  for (const uint32_t frame : frames) {
+    const FrameTiles tiles = TilesOfFrame(info, frame);
+    if (!tiles.complete() && !(partial && tiles.committed > 0)) continue;
+    FP_RETURN_IF_ERROR(FetchFrame(info, frame, partial, sink));
+    ++fetched;
+  }
+  return fetched;
+}
+
+absl::Status JobRun::FetchFrame(const JobInfo& info, uint32_t frame, bool partial,
+                                const FrameSink& sink) {
+  const JobId& job = info.status.id;
+  FP_ASSIGN_OR_RETURN(Stitcher stitcher, Stitcher::Create(info, frame, partial));
   for (int round = 0; round < kFetchRounds; ++round) {
     const std::vector<uint32_t> missing = stitcher.Missing();
     if (missing.empty()) break;
@@ -141,11 +203,14 @@ absl::StatusOr<FinishedJob> JobRun::Fetch(const JobId& job) {
     }
   }
   const std::vector<uint32_t> missing = stitcher.Missing();
-  if (missing.empty()) return FinishedJob{std::move(info), std::move(stitcher).TakeFilm()};
-  return absl::UnavailableError("tile " + std::to_string(missing[0]) + " and " +
-                                std::to_string(missing.size() - 1) + " more of job " + job.value +
-                                " arrived damaged " + std::to_string(kFetchRounds) +
-                                " times; check the network and the coordinator's disk");
+  if (!missing.empty()) {
+    return absl::UnavailableError("tile " + std::to_string(missing[0]) + " and " +
+                                  std::to_string(missing.size() - 1) + " more of job " + job.value +
+                                  " arrived damaged " + std::to_string(kFetchRounds) +
+                                  " times; check the network and the coordinator's disk");
+  }
+  const FrameTiles tiles = TilesOfFrame(info, frame);
+  return sink(info, {frame, std::move(stitcher).TakeFilm(), tiles.total - tiles.committed});
 }
 
 }  // namespace farpoint

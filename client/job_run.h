@@ -2,7 +2,10 @@
 // embedded mode; only the link differs.
 #pragma once
 
+#include <functional>
+#include <span>
 #include <string>
+#include <vector>
 
 #include "client/console.h"
 #include "client/farm_link.h"
@@ -14,10 +17,14 @@
 
 namespace farpoint {
 
-struct FinishedJob {
-  JobInfo info;
-  Film film;  // of the crop, rounded to storage; every tile's hash was checked
+struct FetchedFrame {
+  uint32_t frame = 0;          // index into info.frames
+  Film film;                   // of the crop, rounded to storage; every tile's hash was checked
+  uint32_t missing_tiles = 0;  // not committed yet: their pixels are zero
 };
+// Takes a frame as soon as its last tile is in; the film is freed before the next one is fetched.
+// An error ends the call and is returned.
+using FrameSink = std::function<absl::Status(const JobInfo& info, FetchedFrame frame)>;
 
 // Not thread-safe. The references must outlive this.
 class JobRun {
@@ -30,21 +37,30 @@ class JobRun {
   absl::StatusOr<JobId> Submit(const PreparedRequest& request);
 
   // Until the job is done (OK). A failed job's own error; kCancelled if the job was cancelled or
-  // `stop` raised. Shows notes and progress.
-  absl::Status Wait(const JobId& job);
+  // `stop` raised. Shows notes and progress. With `sink`, every frame goes there once while the job
+  // runs; of a job that fails or is cancelled, those that are complete.
+  absl::Status Wait(const JobId& job, const FrameSink& sink = nullptr);
 
-  // Every tile of a job that is done, checked and stitched. A damaged tile is fetched again, a few
-  // times, then kUnavailable. kFailedPrecondition if the job is not done.
-  absl::StatusOr<FinishedJob> Fetch(const JobId& job);
+  absl::StatusOr<JobInfo> Info(const JobId& job);
+
+  // Fetches `frames` (indices into info.frames) one after the other. A damaged tile is fetched
+  // again, a few times, then kUnavailable. A frame that is not complete is left out; with `partial`
+  // it is handed on as it is, if it has any tile. Returns how many frames the sink got.
+  absl::StatusOr<size_t> Fetch(const JobInfo& info, std::span<const uint32_t> frames, bool partial,
+                               const FrameSink& sink);
 
  private:
+  absl::Status FetchFrame(const JobInfo& info, uint32_t frame, bool partial, const FrameSink& sink);
+  // Hands on the frames that are complete and not marked in `taken` yet, and marks them.
+  absl::Status TakeComplete(const JobInfo& info, std::vector<bool>& taken, const FrameSink& sink);
+
   FarmLink& link_;
   Retry& retry_;
   const StopFlag& stop_;
   Console& console_;
 };
 
-// The state of a job that has ended as a status: OK if it is done.
+// The state of a job as a status: OK if it is done, kUnavailable if it has not ended.
 absl::Status OutcomeOf(const JobStatus& status);
 
 }  // namespace farpoint

@@ -7,8 +7,10 @@
 #include <cstdint>
 #include <limits>
 
+#include "client/frame_range.h"
 #include "client/nearest_name.h"
 #include "core/image/layers.h"
+#include "core/scene/scene_format.h"
 
 namespace farpoint {
 namespace {
@@ -208,6 +210,66 @@ absl::Status ApplyFov(std::string_view value, JobEdit& edit) {
   return absl::OkStatus();
 }
 
+// --env-rotation and its like turn what --env or the job file names.
+absl::Status EnvironmentOf(JobEdit& edit, EnvironmentOverride*& environment) {
+  if (!edit.spec.overrides.environment) {
+    return Bad("belongs to an environment map; give --env FILE.exr too");
+  }
+  environment = &*edit.spec.overrides.environment;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyEnvScale(std::string_view value, JobEdit& edit) {
+  EnvironmentOverride* environment = nullptr;
+  FP_RETURN_IF_ERROR(EnvironmentOf(edit, environment));
+  double scale = 0;
+  if (ParseFinite(value, scale)) {
+    if (scale < 0 || scale > kMaxRadiance) return Bad("the number must lie in [0, 1e30]");
+    environment->scale = Rgb(Vec3d(scale, scale, scale));
+    return absl::OkStatus();
+  }
+  if (value.find(',') == std::string_view::npos) return Bad("expected one number or r,g,b");
+  return ParseColor(value, kMaxRadiance, environment->scale);
+}
+
+absl::Status ApplyEnvRotation(std::string_view value, JobEdit& edit) {
+  EnvironmentOverride* environment = nullptr;
+  FP_RETURN_IF_ERROR(EnvironmentOf(edit, environment));
+  double degrees = 0;
+  if (!ParseFinite(value, degrees) || std::abs(degrees) > 1e6) {
+    return Bad("expected an angle in degrees");
+  }
+  environment->rotation_deg = degrees;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyEnvUp(std::string_view value, JobEdit& edit) {
+  EnvironmentOverride* environment = nullptr;
+  FP_RETURN_IF_ERROR(EnvironmentOf(edit, environment));
+  std::optional<Vec3d> up;
+  FP_RETURN_IF_ERROR(ParseDirection(value, up));
+  environment->up = *up;
+  return absl::OkStatus();
+}
+
+absl::Status ApplyFilterWidth(std::string_view value, JobEdit& edit) {
+  double width = 0;
+  if (!ParseFinite(value, width) || std::abs(width) > std::numeric_limits<float>::max()) {
+    return Bad("expected a number of pixels");
+  }
+  edit.spec.settings.filter_width_px = static_cast<float>(width);
+  return absl::OkStatus();
+}
+
+absl::Status ApplyFps(std::string_view value, JobEdit& edit) {
+  double fps = 0;
+  if (!ParseFinite(value, fps) || fps <= 0 || fps > 1000) {
+    return Bad("expected frames per second, more than 0 and at most 1000");
+  }
+  edit.spec.fps = fps;
+  return absl::OkStatus();
+}
+
 // Makes one camera of what the flags say and what the job had.
 absl::Status ResolveCameraFlags(JobEdit& edit) {
   const bool free = edit.eye || edit.target || edit.up || edit.yfov_deg;
@@ -271,6 +333,26 @@ constexpr RenderFlag kRenderFlags[] = {
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.spp);
      }},
+    {"--filter", "NAME", kImage,
+     "how the samples of a pixel are weighted: blackman-harris (the default), gaussian, triangle "
+     "or "
+     "box; of no effect at --spp 1",
+     [](std::string_view value, JobEdit& edit) {
+       FP_ASSIGN_OR_RETURN(edit.spec.settings.filter, PixelFilterFromName(value));
+       return absl::OkStatus();
+     }},
+    {"--filter-width", "PX", kImage,
+     "width of the filter's whole support in pixels, 0.01..16; default 0: the filter's own",
+     ApplyFilterWidth},
+    {"--frames", "RANGE", kImage,
+     "frames of the scene's animation: numbers and ranges with commas, e.g. 1-10x2,15; give -o a "
+     "place for the number, as in out.####.exr; default: one still of the rest pose",
+     [](std::string_view value, JobEdit& edit) {
+       FP_ASSIGN_OR_RETURN(edit.spec.frames, ParseFrameRange(value));
+       return absl::OkStatus();
+     }},
+    {"--fps", "F", kImage, "frame f shows the scene at the time f / F seconds; default 24",
+     ApplyFps},
     {"--aov", "LIST", kImage,
      "more layers besides the default ones, with commas: irradiance, direct_irradiance, …; 'none' "
      "in front leaves the default ones out",
@@ -351,6 +433,21 @@ constexpr RenderFlag kRenderFlags[] = {
        edit.spec.overrides.sky = sky;
        return absl::OkStatus();
      }},
+    {"--env", "FILE", kLights,
+     "an environment map, lat-long .exr or .hdr, in place of the scene's sky and map; --sky adds "
+     "to it",
+     [](std::string_view value, JobEdit& edit) {
+       if (value.empty()) return Bad("expected a file");
+       // Of a job file's map only the orientation and the scale stay.
+       if (!edit.spec.overrides.environment) edit.spec.overrides.environment.emplace();
+       edit.spec.overrides.environment->uri = std::string(value);
+       return absl::OkStatus();
+     }},
+    {"--env-rotation", "DEG", kLights,
+     "turns the map about its up, counter-clockwise seen from above; default 0", ApplyEnvRotation},
+    {"--env-scale", "S", kLights, "scales the map's radiance: one number or r,g,b; default 1",
+     ApplyEnvScale},
+    {"--env-up", "x,y,z", kLights, "where the map's top points; default 0,1,0", ApplyEnvUp},
     {"--albedo", "r,g,b", kLights,
      "replaces every material's base colour and its texture, each in [0, 1]",
      [](std::string_view value, JobEdit& edit) {
@@ -384,7 +481,6 @@ constexpr RefusedFlag kRefusedFlags[] = {
      "filling cluster buffers by rays is not built yet; leave the flag out: the tree's "
      "cut fills them"},
     {"--quality", "quality levels are not built yet; set --points, --clusters and --microbuffer"},
-    {"--env", "environment maps are not built yet; use --sky r,g,b for a constant sky"},
 };
 
 std::string Lower(std::string_view text) {
@@ -431,16 +527,10 @@ absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec) {
 bool IsJobFile(std::string_view path) { return Lower(path).ends_with(".json"); }
 
 absl::Status CheckScenePath(std::string_view path) {
-  const std::string lower = Lower(path);
-  if (lower.ends_with(".gltf") || lower.ends_with(".glb") || lower.ends_with(".json")) {
-    return absl::OkStatus();
-  }
-  if (lower.ends_with(".obj") || lower.ends_with(".ply")) {
-    return Bad(std::string(path) + ": " + lower.substr(lower.size() - 4) +
-               " scenes are not built yet; convert the scene to glTF 2.0 (.gltf or .glb)");
-  }
-  return Bad(std::string(path) +
-             ": not a scene by its name; expected .gltf, .glb or a job file .json");
+  if (IsJobFile(path)) return absl::OkStatus();
+  const absl::Status format = SceneFormatOf(std::string(path)).status();
+  if (format.ok()) return format;
+  return Bad(std::string(format.message()) + "; or name a job file .json");
 }
 
 }  // namespace farpoint

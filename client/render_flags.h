@@ -55,10 +55,11 @@ using GivenFlag = std::pair<std::string, std::string>;
 
 // Applies the flags to `spec` (what came from a job file, or the defaults) in the order of
 // RenderFlags(). kInvalidArgument names the flag, its value and what is allowed; `spec` is then
-// unchanged. A film that neither had becomes kDefaultWidth x kDefaultHeight.
+// unchanged. A film that neither had becomes kDefaultWidth x kDefaultHeight. --env leaves a path of
+// this machine in overrides.environment->uri: PrepareRequest reads it.
 absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec);
 
-// kInvalidArgument unless the scene's name ends in .gltf, .glb or .json (any case).
+// kInvalidArgument unless the name is that of a job file or of a scene format that is known.
 absl::Status CheckScenePath(std::string_view path);
 bool IsJobFile(std::string_view path);
 

@@ -1,6 +1,7 @@
 #include "client/stitcher.h"
 
 #include <algorithm>
+#include <span>
 #include <string>
 #include <utility>
 
@@ -12,25 +13,52 @@ std::string RectText(const PixelRect& r) {
          std::to_string(r.y1);
 }
 
+// The tiles of a frame; none for an index that does not exist. Coordinators of our version send the
+// same number of tiles for each frame.
+std::span<const TileInfo> SpanOfFrame(const JobInfo& info, uint32_t frame) {
+  const size_t frames = info.frames.size();
+  if (frame >= frames) return {};
+  const size_t count = info.tiles.size() / frames;
+  return std::span(info.tiles).subspan(frame * count, count);
+}
+
 }  // namespace
 
-Stitcher::Stitcher(const JobInfo& info, Film film)
-    : tiles_(info.tiles), have_(info.tiles.size(), false), film_(std::move(film)) {}
+Stitcher::Stitcher(uint32_t first_tile, std::vector<TileInfo> tiles, Film film)
+    : first_tile_(first_tile),
+      tiles_(std::move(tiles)),
+      have_(tiles_.size(), false),
+      film_(std::move(film)) {}
 
-absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info) {
+FrameTiles TilesOfFrame(const JobInfo& info, uint32_t frame) {
+  FrameTiles tiles;
+  for (const TileInfo& tile : SpanOfFrame(info, frame)) {
+    ++tiles.total;
+    if (!tile.sha256.empty()) ++tiles.committed;
+  }
+  return tiles;
+}
+
+absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info, uint32_t frame, bool partial) {
   FP_RETURN_IF_ERROR(Annotate(ValidateFilm(info.spec.film), "job " + info.status.id.value));
   const PixelRect& crop = info.spec.film.crop;
+  const std::span<const TileInfo> tiles = SpanOfFrame(info, frame);
+  const auto first = static_cast<uint32_t>(frame * tiles.size());
   int64_t covered = 0;
-  for (size_t i = 0; i < info.tiles.size(); ++i) {
-    const TileInfo& tile = info.tiles[i];
-    if (tile.rect.empty() || !crop.Contains(tile.rect)) {
-      return absl::InvalidArgumentError("tile " + std::to_string(i) + " has the pixels " +
-                                        RectText(tile.rect) + " outside the crop " +
-                                        RectText(crop) + "; coordinator and client do not match");
+  for (size_t i = 0; i < tiles.size(); ++i) {
+    const TileInfo& tile = tiles[i];
+    const std::string name = "tile " + std::to_string(first + i);
+    if (tile.frame != frame) {
+      return absl::InvalidArgumentError(name + " is not one of frame " + std::to_string(frame) +
+                                        "; coordinator and client do not match");
     }
-    if (tile.sha256.empty()) {
-      return absl::FailedPreconditionError("tile " + std::to_string(i) + " of job " +
-                                           info.status.id.value +
+    if (tile.rect.empty() || !crop.Contains(tile.rect)) {
+      return absl::InvalidArgumentError(name + " has the pixels " + RectText(tile.rect) +
+                                        " outside the crop " + RectText(crop) +
+                                        "; coordinator and client do not match");
+    }
+    if (tile.sha256.empty() && !partial) {
+      return absl::FailedPreconditionError(name + " of job " + info.status.id.value +
                                            " is not committed yet; wait until the job is done");
     }
     covered += tile.rect.area();
@@ -38,7 +66,7 @@ absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info) {
   // Inside the crop, not overlapping, and as large together: then each pixel is there once. Tiles
   // lie on a grid, so that two overlap only if they share a corner row and column.
   std::vector<PixelRect> sorted;
-  for (const TileInfo& tile : info.tiles) sorted.push_back(tile.rect);
+  for (const TileInfo& tile : tiles) sorted.push_back(tile.rect);
   std::sort(sorted.begin(), sorted.end(), [](const PixelRect& a, const PixelRect& b) {
     return std::pair(a.y0, a.x0) < std::pair(b.y0, b.x0);
   });
@@ -58,17 +86,19 @@ absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info) {
                                       " pixels, the crop has " + std::to_string(crop.area()) +
                                       "; coordinator and client do not match");
   }
-  return Stitcher(info, Film(crop, info.spec.settings.layers));
+  return Stitcher(first, {tiles.begin(), tiles.end()}, Film(crop, info.spec.settings.layers));
 }
 
 absl::Status Stitcher::Add(const TileData& tile) {
   const std::string name = "tile " + std::to_string(tile.tile);
-  if (tile.tile >= tiles_.size()) {
-    return absl::DataLossError(name + " is not one of the job's " + std::to_string(tiles_.size()) +
-                               " tiles");
+  // Wraps around for a smaller number.
+  const uint32_t index = tile.tile - first_tile_;
+  if (index >= tiles_.size()) {
+    return absl::DataLossError(name + " is not one of the frame's " +
+                               std::to_string(tiles_.size()) + " tiles");
   }
-  if (have_[tile.tile]) return absl::OkStatus();
-  const TileInfo& expected = tiles_[tile.tile];
+  if (have_[index]) return absl::OkStatus();
+  const TileInfo& expected = tiles_[index];
   const Digest actual = tile.bytes.Hash();
   if (actual != expected.sha256) {
     return absl::DataLossError(name + " arrived damaged: its SHA-256 is " + actual.Hex() +
@@ -85,14 +115,16 @@ absl::Status Stitcher::Add(const TileData& tile) {
     return absl::DataLossError(name + " has other layers than the job");
   }
   film_.Paste(*film);
-  have_[tile.tile] = true;
+  have_[index] = true;
   return absl::OkStatus();
 }
 
 std::vector<uint32_t> Stitcher::Missing() const {
   std::vector<uint32_t> missing;
   for (size_t i = 0; i < have_.size(); ++i) {
-    if (!have_[i]) missing.push_back(static_cast<uint32_t>(i));
+    if (!have_[i] && !tiles_[i].sha256.empty()) {
+      missing.push_back(first_tile_ + static_cast<uint32_t>(i));
+    }
   }
   return missing;
 }

@@ -1,5 +1,5 @@
-// Puts a job's tiles together. Nothing of a tile is believed: its hash, its rectangle and its
-// layers are checked against what the coordinator announced. Not thread-safe.
+// Puts the tiles of one frame together. Nothing of a tile is believed: its hash, its rectangle and
+// its layers are checked against what the coordinator announced. Not thread-safe.
 #pragma once
 
 #include <cstdint>
@@ -12,25 +12,35 @@
 
 namespace farpoint {
 
+// How much of a frame can be fetched.
+struct FrameTiles {
+  uint32_t committed = 0, total = 0;  // total is 0 before the coordinator knows the tiles
+  bool complete() const { return total > 0 && committed == total; }
+};
+// `frame` is an index into info.frames.
+FrameTiles TilesOfFrame(const JobInfo& info, uint32_t frame);
+
 class Stitcher {
  public:
-  // kFailedPrecondition if a tile is not committed yet, kInvalidArgument unless the tiles cover the
-  // crop exactly: each pixel once.
-  static absl::StatusOr<Stitcher> Create(const JobInfo& info);
+  // Of info.frames[frame]. kInvalidArgument unless the frame's tiles cover the crop exactly: each
+  // pixel once. kFailedPrecondition if a tile is not committed yet, unless `partial`: then its
+  // pixels stay zero and it is not missing.
+  static absl::StatusOr<Stitcher> Create(const JobInfo& info, uint32_t frame, bool partial = false);
 
-  // kDataLoss names the tile and what is wrong with it; the film is then unchanged. A tile that is
-  // there already is ignored.
+  // `tile.tile` counts over the whole job. kDataLoss names the tile and what is wrong with it; the
+  // film is then unchanged. A tile that is there already is ignored.
   absl::Status Add(const TileData& tile);
 
-  // Ascending.
+  // Ascending, counted over the whole job.
   std::vector<uint32_t> Missing() const;
   const Film& film() const { return film_; }
   Film TakeFilm() && { return std::move(film_); }
 
  private:
-  Stitcher(const JobInfo& info, Film film);
+  Stitcher(uint32_t first_tile, std::vector<TileInfo> tiles, Film film);
 
-  std::vector<TileInfo> tiles_;
+  uint32_t first_tile_;
+  std::vector<TileInfo> tiles_;  // of the frame
   std::vector<bool> have_;
   Film film_;
 };

@@ -92,10 +92,40 @@ TEST(CommandLine, Submit) {
                   .farm_ignores);
 }
 
-TEST(CommandLine, DetachWritesNothing) {
+TEST(CommandLine, DetachNeedsNoOutputButTakesOne) {
   EXPECT_TRUE(Parse({"submit", "a.glb", "--detach", "--coordinator", "h:1"}).detach);
-  EXPECT_THAT(Refusal({"submit", "a.glb", "--detach", "-o", "o.exr", "--coordinator", "h:1"}),
-              HasSubstr("farpoint fetch"));
+  const CommandLine line =
+      Parse({"submit", "a.glb", "--detach", "-o", "o.####.exr", "--coordinator", "h:1"});
+  EXPECT_TRUE(line.detach);
+  EXPECT_EQ(line.output, "o.####.exr");
+  EXPECT_THAT(Refusal({"submit", "a.glb", "--detach", "-o", "o.png", "--coordinator", "h:1"}),
+              HasSubstr(".exr"));
+}
+
+TEST(CommandLine, SubmitMayWaitForOthersAndStartPaused) {
+  const CommandLine line = Parse({"submit", "a.glb", "-o", "o.exr", "--coordinator", "h:1",
+                                  "--after", "a1,b2", "--after=c3", "--paused"});
+  EXPECT_THAT(line.after, ElementsAre("a1", "b2", "c3"));
+  EXPECT_TRUE(line.paused);
+  for (const char* list : {",", "a,", ",a", "a,,b"}) {
+    EXPECT_THAT(Refusal({"submit", "a.glb", "--detach", "--coordinator", "h:1", "--after", list}),
+                StartsWith("--after: "))
+        << list;
+  }
+  std::string many = "a";
+  for (int i = 0; i < 64; ++i) many += ",a";
+  EXPECT_THAT(Refusal({"submit", "a.glb", "--detach", "--coordinator", "h:1", "--after", many}),
+              HasSubstr("at most 64"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--after", "a"}),
+              HasSubstr("unknown flag of farpoint render"));
+}
+
+TEST(CommandLine, Compression) {
+  EXPECT_EQ(Parse({"render", "a.glb", "-o", "o.exr"}).compression, ExrCompression::kZip);
+  EXPECT_EQ(Parse({"render", "a.glb", "-o", "o.exr", "--compression", "dwaa"}).compression,
+            ExrCompression::kDwaa);
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--compression", "jpeg"}),
+              AllOf(StartsWith("--compression jpeg: "), HasSubstr("zips")));
 }
 
 TEST(CommandLine, CoordinatorFromTheEnvironmentOrTheFlag) {
@@ -107,15 +137,75 @@ TEST(CommandLine, CoordinatorFromTheEnvironmentOrTheFlag) {
   }
 }
 
-TEST(CommandLine, StatusCancelFetch) {
-  const CommandLine status = Parse({"status", "12ab", "--json", "-", "--coordinator", "h:1"});
+std::vector<std::string> OnFarm(std::vector<std::string> args) {
+  args.insert(args.end(), {"--coordinator", "h:1"});
+  return args;
+}
+
+TEST(CommandLine, CommandsOnJobsTakeAsManyAsTheyCanUse) {
+  const CommandLine status = Parse(OnFarm({"status", "12ab", "--json", "-"}));
   EXPECT_EQ(status.verb, Verb::kStatus);
-  EXPECT_EQ(status.job, "12ab");
+  EXPECT_THAT(status.jobs, ElementsAre("12ab"));
   EXPECT_EQ(status.json, "-");
-  EXPECT_EQ(Parse({"cancel", "12ab", "--coordinator", "h:1"}).verb, Verb::kCancel);
-  EXPECT_EQ(Parse({"fetch", "12ab", "-o", "o.exr", "--coordinator", "h:1"}).verb, Verb::kFetch);
-  EXPECT_THAT(Refusal({"cancel", "--coordinator", "h:1"}), StartsWith("JOB: not given"));
-  EXPECT_THAT(Refusal({"fetch", "x", "--coordinator", "h:1"}), StartsWith("-o: not given"));
+  EXPECT_TRUE(Parse(OnFarm({"status"})).jobs.empty());
+  EXPECT_THAT(Refusal(OnFarm({"status", "a", "b"})), HasSubstr("one argument too many"));
+
+  const std::pair<const char*, Verb> several[] = {{"pause", Verb::kPause},
+                                                  {"resume", Verb::kResume},
+                                                  {"cancel", Verb::kCancel},
+                                                  {"requeue", Verb::kRequeue},
+                                                  {"watch", Verb::kWatch}};
+  for (const auto& [name, verb] : several) {
+    const CommandLine line = Parse(OnFarm({name, "a", "--quiet", "b"}));
+    EXPECT_EQ(line.verb, verb);
+    EXPECT_THAT(line.jobs, ElementsAre("a", "b")) << name;
+    EXPECT_TRUE(line.quiet);
+    if (verb != Verb::kWatch) {
+      EXPECT_THAT(Refusal(OnFarm({name})), StartsWith("JOB: not given")) << name;
+    }
+  }
+  EXPECT_TRUE(Parse(OnFarm({"watch"})).jobs.empty());
+  EXPECT_TRUE(Parse(OnFarm({"requeue", "a", "--all"})).all);
+  EXPECT_FALSE(Parse(OnFarm({"requeue", "a"})).all);
+
+  for (const char* name : {"logs", "explain"}) {
+    EXPECT_THAT(Parse(OnFarm({name, "a"})).jobs, ElementsAre("a"));
+    EXPECT_THAT(Refusal(OnFarm({name})), StartsWith("JOB: not given"));
+    EXPECT_THAT(Refusal(OnFarm({name, "a", "b"})), HasSubstr("one argument too many"));
+  }
+  EXPECT_TRUE(Parse(OnFarm({"logs", "a", "--follow"})).follow);
+  EXPECT_EQ(Parse(OnFarm({"workers"})).verb, Verb::kWorkers);
+  EXPECT_THAT(Refusal(OnFarm({"workers", "a"})), HasSubstr("one argument too many"));
+}
+
+TEST(CommandLine, Priority) {
+  for (const char* number : {"-7", "7", "-1000", "0"}) {
+    const CommandLine line = Parse(OnFarm({"priority", "12ab", number}));
+    EXPECT_EQ(line.verb, Verb::kPriority);
+    EXPECT_THAT(line.jobs, ElementsAre("12ab"));
+    EXPECT_EQ(line.priority, std::stoi(number));
+  }
+  EXPECT_THAT(Refusal(OnFarm({"priority", "12ab"})), StartsWith("N: not given"));
+  EXPECT_THAT(Refusal(OnFarm({"priority"})), StartsWith("JOB: not given"));
+  EXPECT_THAT(Refusal(OnFarm({"priority", "12ab", "1001"})), StartsWith("N 1001: "));
+  EXPECT_THAT(Refusal(OnFarm({"priority", "12ab", "high"})), StartsWith("N high: "));
+  EXPECT_THAT(Refusal(OnFarm({"priority", "12ab", "1", "2"})), HasSubstr("too many"));
+  EXPECT_THAT(Refusal(OnFarm({"priority", "12ab", "-x"})), HasSubstr("unknown flag"));
+}
+
+TEST(CommandLine, Fetch) {
+  const CommandLine line =
+      Parse(OnFarm({"fetch", "12ab", "-o", "o.##.exr", "--frames", "1-5x2", "--partial"}));
+  EXPECT_EQ(line.verb, Verb::kFetch);
+  EXPECT_THAT(line.frames, ElementsAre(1, 3, 5));
+  EXPECT_TRUE(line.partial);
+  EXPECT_TRUE(Parse(OnFarm({"fetch", "12ab", "-o", "o.exr", "--wait"})).wait);
+  EXPECT_THAT(Refusal(OnFarm({"fetch", "x"})), StartsWith("-o: not given"));
+  EXPECT_THAT(Refusal(OnFarm({"fetch", "-o", "o.exr"})), StartsWith("JOB: not given"));
+  EXPECT_THAT(Refusal(OnFarm({"fetch", "x", "-o", "o.exr", "--frames", "5-"})),
+              AllOf(StartsWith("--frames 5-: "), HasSubstr("1-10x2,15")));
+  EXPECT_THAT(Refusal(OnFarm({"fetch", "x", "-o", "o.exr", "--partial", "--wait"})),
+              StartsWith("--partial: "));
 }
 
 TEST(CommandLine, Compare) {
@@ -135,11 +225,14 @@ TEST(CommandLine, Compare) {
 }
 
 TEST(CommandLine, HelpAndVersionPrintAndNeedNothingElse) {
-  for (const char* verb : {"render", "submit", "status", "cancel", "fetch", "compare"}) {
+  for (const char* verb :
+       {"render", "submit", "status", "watch", "fetch", "pause", "resume", "cancel", "requeue",
+        "priority", "workers", "logs", "explain", "compare"}) {
     const CommandLine line = Parse({verb, "--help"});
     ASSERT_TRUE(line.print.has_value());
     EXPECT_THAT(*line.print, HasSubstr("--log-level"));
-    EXPECT_THAT(*Parse({"--help"}).print, HasSubstr(std::string("farpoint ") + verb));
+    EXPECT_THAT(*line.print, StartsWith(std::string("farpoint ") + verb));
+    EXPECT_THAT(*Parse({"--help"}).print, HasSubstr(verb));
   }
   for (const RenderFlag& flag : RenderFlags()) {
     EXPECT_THAT(*Parse({"render", "-h"}).print, HasSubstr(std::string(flag.name)));
@@ -159,11 +252,24 @@ TEST(CommandLine, NamesTheNearestCommandAndFlag) {
 }
 
 TEST(CommandLine, RefusesWhatIsNotBuiltYet) {
-  for (const char* flag : {"--fill", "--quality", "--env"}) {
+  for (const char* flag : {"--fill", "--quality"}) {
     EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", flag, "x"}),
                 AllOf(StartsWith(flag), HasSubstr("not built yet")));
   }
-  EXPECT_THAT(Refusal({"render", "a.obj", "-o", "o.exr"}), HasSubstr("not built yet"));
+}
+
+TEST(CommandLine, SaysWhatAValueIsMissingFor) {
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o"}), StartsWith("-o: needs a value"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--spp"}),
+              StartsWith("--spp: needs a value"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "--png", "--quiet", "-o", "o.exr"}),
+              StartsWith("--png: needs a value"));
+  EXPECT_THAT(Refusal({"render", "--spp=", "a.glb", "-o", "o.exr"}),
+              StartsWith("--spp: needs a value"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--no-skip=true"}),
+              StartsWith("--no-skip: is a switch"));
+  EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", "/nowhere", "--tile"}),
+              StartsWith("--tile: needs a value"));
 }
 
 TEST(CommandLine, RefusesWhatIsMissingTooMuchOrWrong) {
@@ -173,7 +279,7 @@ TEST(CommandLine, RefusesWhatIsMissingTooMuchOrWrong) {
   EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--png", "o.jpg"}), HasSubstr(".png"));
   EXPECT_THAT(Refusal({"render", "a.glb", "b.glb", "-o", "o.exr"}),
               HasSubstr("one argument too many"));
-  EXPECT_THAT(Refusal({"render", "a.glb", "-o"}), HasSubstr("--output"));
+  EXPECT_THAT(Refusal({"render", "a.xyz", "-o", "o.exr"}), HasSubstr(".gltf"));
   EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--workers", "0"}),
               StartsWith("--workers 0: expected a whole number from 1 to 256"));
   EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--threads", "two"}),
@@ -207,7 +313,7 @@ TEST_F(ConfigFile, NamesFileLineAndNearestName) {
 
 TEST_F(ConfigFile, RefusesWhatIsNoSetting) {
   for (const char* text : {"spp\n", "no-skip = yes\n", "config = other\n", "help = true\n",
-                           "[render]\n", "fill = cut\n"}) {
+                           "[render]\n", "fill = cut\n", "spp =\n", "spp = \"\"\n"}) {
     const std::string path = Write(text);
     EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", path}),
                 StartsWith(path + ":1: "))

@@ -25,6 +25,7 @@ class FakeJobs final : public v1::JobService::Service {
   std::vector<v1::TileChunk> chunks;
   v1::SubmitRequest submitted;
   std::atomic<bool> watching{false};
+  std::vector<std::string> told;
 
   grpc::Status Submit(grpc::ServerContext*, const v1::SubmitRequest* request,
                       v1::SubmitResponse* response) override {
@@ -35,6 +36,32 @@ class FakeJobs final : public v1::JobService::Service {
   grpc::Status Status(grpc::ServerContext*, const v1::StatusRequest* request,
                       v1::StatusResponse*) override {
     return {grpc::StatusCode::NOT_FOUND, "job " + request->job_id() + " is not known"};
+  }
+  grpc::Status Pause(grpc::ServerContext*, const v1::PauseRequest* request,
+                     v1::PauseResponse*) override {
+    told.push_back("pause " + request->job_id());
+    return grpc::Status::OK;
+  }
+  grpc::Status Resume(grpc::ServerContext*, const v1::ResumeRequest* request,
+                      v1::ResumeResponse*) override {
+    told.push_back("resume " + request->job_id());
+    return grpc::Status::OK;
+  }
+  grpc::Status SetPriority(grpc::ServerContext*, const v1::SetPriorityRequest* request,
+                           v1::SetPriorityResponse*) override {
+    told.push_back("priority " + request->job_id() + " " + std::to_string(request->priority()));
+    return grpc::Status::OK;
+  }
+  grpc::Status Requeue(grpc::ServerContext*, const v1::RequeueRequest* request,
+                       v1::RequeueResponse*) override {
+    told.push_back("requeue " + request->job_id() + (request->all() ? " all" : ""));
+    return grpc::Status::OK;
+  }
+  grpc::Status Explain(grpc::ServerContext*, const v1::ExplainRequest* request,
+                       v1::ExplainResponse* response) override {
+    response->add_lines("job " + request->job_id());
+    response->add_lines("waits");
+    return grpc::Status::OK;
   }
   // Sends one event, then says nothing for as long as the client listens.
   grpc::Status Watch(grpc::ServerContext* context, const v1::WatchRequest* request,
@@ -185,11 +212,36 @@ TEST_F(GrpcFarmLinkTest, ASignalEndsAWatch) {
     }
     stop_.Raise(2);
   });
-  const absl::Status status = link_->Watch(
-      JobId{"1"}, 41, [&](const JobEvent& event) { sequences.push_back(event.sequence); });
+  const absl::Status status = link_->Watch(JobId{"1"}, 41, [&](const JobEvent& event) {
+    sequences.push_back(event.sequence);
+    return absl::OkStatus();
+  });
   raiser.join();
   EXPECT_TRUE(absl::IsCancelled(status)) << status;
   EXPECT_THAT(sequences, testing::ElementsAre(42u));
+}
+
+TEST_F(GrpcFarmLinkTest, TheReceiversErrorEndsTheWatch) {
+  int events = 0;
+  const absl::Status status = link_->Watch(JobId{"1"}, 0, [&](const JobEvent&) {
+    ++events;
+    return absl::AbortedError("enough");
+  });
+  EXPECT_EQ(status, absl::AbortedError("enough"));
+  EXPECT_EQ(events, 1);
+}
+
+TEST_F(GrpcFarmLinkTest, CarriesWhatJobsAreToldToDo) {
+  EXPECT_TRUE(link_->Pause(JobId{"a1"}).ok());
+  EXPECT_TRUE(link_->Resume(JobId{"b2"}).ok());
+  EXPECT_TRUE(link_->SetPriority(JobId{"c3"}, -7).ok());
+  EXPECT_TRUE(link_->Requeue(JobId{"d4"}, false).ok());
+  EXPECT_TRUE(link_->Requeue(JobId{"e5"}, true).ok());
+  EXPECT_THAT(jobs_.told, testing::ElementsAre("pause a1", "resume b2", "priority c3 -7",
+                                               "requeue d4", "requeue e5 all"));
+  const auto explanation = link_->Explain(JobId{"f6"});
+  ASSERT_TRUE(explanation.ok()) << explanation.status();
+  EXPECT_THAT(explanation->lines, testing::ElementsAre("job f6", "waits"));
 }
 
 TEST_F(GrpcFarmLinkTest, ASignalEndsAnUpload) {

@@ -3,6 +3,9 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <filesystem>
+
+#include "core/image/exr_io.h"
 #include "tests/unit/client/temp_folder.h"
 
 namespace farpoint {
@@ -79,9 +82,72 @@ TEST_F(PrepareRequestTest, DamagedJobFilesAreTheFilesFault) {
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "../scenes/a.gltf"}, "settings": {"spp": 0}})")),
               AllOf(StartsWith(folder_.File("jobs/job.json")), HasSubstr("spp")));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "job.json"}})")), HasSubstr("job file"));
-  EXPECT_THAT(FileError(Job(R"({"asset": {"root": "a.obj"}})")), HasSubstr("not built yet"));
+  EXPECT_THAT(FileError(Job(R"({"asset": {"root": "a.xyz"}})")),
+              AllOf(HasSubstr("asset.root"), HasSubstr(".gltf")));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "../scenes/a.gltf", "files": [{"uri": "x"}]}})")),
               HasSubstr("asset.files"));
+}
+
+// A lat-long map of one colour.
+std::string WriteMap(const std::string& path) {
+  Film film({0, 0, 8, 4}, {Layer::kIrradiance});
+  EXPECT_TRUE(WriteExr(path, film, 8, 4, {}, ExrCompression::kZip).ok());
+  return path;
+}
+std::string WriteEnvironment(const std::string& path) {
+  Film film({0, 0, 8, 4}, {Layer::kBeauty});
+  for (float& value : film.Plane(Layer::kBeauty, 0)) value = 2;
+  EXPECT_TRUE(WriteExr(path, film, 8, 4, {}, ExrCompression::kZip).ok());
+  return path;
+}
+
+TEST_F(PrepareRequestTest, AnEnvironmentMapBecomesAFileOfTheAsset) {
+  std::filesystem::create_directories(folder_.File("maps"));
+  const std::string path = WriteEnvironment(folder_.File("maps/day.exr"));
+  const auto request = Prepare(
+      folder_.File("scenes/a.gltf"),
+      {{"--env", path}, {"--env-rotation", "90"}, {"--env-scale", "2"}, {"--env-up", "0,0,1"}});
+  ASSERT_TRUE(request.ok()) << request.status();
+  const auto& environment = request->spec.overrides.environment;
+  ASSERT_TRUE(environment.has_value());
+  EXPECT_EQ(environment->uri, "env/day.exr");
+  EXPECT_EQ(environment->rotation_deg, 90);
+  EXPECT_EQ(environment->scale, Rgb(2, 2, 2));
+  EXPECT_EQ(environment->up.z, 1);
+  EXPECT_EQ(request->asset.files.at("env/day.exr").Hash(),
+            request->spec.asset_files.at("env/day.exr"));
+}
+
+TEST_F(PrepareRequestTest, AJobFileNamesItsMapFromItsOwnFolder) {
+  std::filesystem::create_directories(folder_.File("maps"));
+  WriteEnvironment(folder_.File("maps/day.exr"));
+  const std::string night = WriteEnvironment(folder_.File("maps/night.exr"));
+  const std::string job = Job(R"({"asset": {"root": "../scenes/a.gltf"}, "overrides":
+      {"environment": {"uri": "../maps/day.exr", "rotation_deg": 30}}})");
+  auto request = Prepare(job);
+  ASSERT_TRUE(request.ok()) << request.status();
+  EXPECT_EQ(request->spec.overrides.environment->uri, "env/day.exr");
+  EXPECT_EQ(request->spec.overrides.environment->rotation_deg, 30);
+  request = Prepare(job, {{"--env", night}, {"--env-scale", "1,0.5,0"}});
+  ASSERT_TRUE(request.ok()) << request.status();
+  EXPECT_EQ(request->spec.overrides.environment->uri, "env/night.exr");
+  EXPECT_EQ(request->spec.overrides.environment->rotation_deg, 30) << "what no flag names stays";
+  EXPECT_EQ(request->spec.overrides.environment->scale, Rgb(1, 0.5f, 0));
+  EXPECT_FALSE(request->asset.files.contains("env/day.exr"));
+}
+
+TEST_F(PrepareRequestTest, AMapThatCannotBeReadIsNamedBeforeAnythingIsSent) {
+  const auto error = [&](const std::string& path) {
+    const auto request = Prepare(folder_.File("scenes/a.gltf"), {{"--env", path}});
+    EXPECT_FALSE(request.ok());
+    EXPECT_FALSE(usage_error_);
+    return std::string(request.status().message());
+  };
+  EXPECT_THAT(error(folder_.File("none.exr")), HasSubstr("none.exr"));
+  EXPECT_THAT(error(folder_.Write("text.exr", "no image")), HasSubstr("text.exr"));
+  EXPECT_THAT(error(WriteMap(folder_.File("layers.exr"))), HasSubstr("layers.exr"));
+  EXPECT_FALSE(Prepare(folder_.File("scenes/a.gltf"), {{"--env-rotation", "3"}}).ok());
+  EXPECT_TRUE(usage_error_);
 }
 
 TEST_F(PrepareRequestTest, MissingFilesAreNamed) {
@@ -95,7 +161,7 @@ TEST_F(PrepareRequestTest, MissingFilesAreNamed) {
 TEST_F(PrepareRequestTest, BadFlagsAreTheCommandLinesFault) {
   EXPECT_FALSE(Prepare(folder_.File("scenes/a.gltf"), {{"--spp", "0"}}).ok());
   EXPECT_TRUE(usage_error_);
-  EXPECT_FALSE(Prepare("scene.obj").ok());
+  EXPECT_FALSE(Prepare("scene.xyz").ok());
   EXPECT_TRUE(usage_error_);
 }
 
@@ -115,23 +181,40 @@ TEST(JobHash, IsDeafToWhatChangesNoPixel) {
   other.title = "another title";
   other.priority = 5;
   other.limits.max_seconds = 3;
+  other.after = {JobId{"a1"}};
+  other.start_paused = true;
+  other.fps = 30;  // of a still
   EXPECT_EQ(JobHash(spec), JobHash(other));
   EXPECT_EQ(ImageSettingsJson(spec), ImageSettingsJson(other));
 }
 
 TEST(JobHash, HearsWhatChangesThePixels) {
   const JobSpec spec = SomeSpec();
-  std::vector<JobSpec> others(6, spec);
+  std::vector<JobSpec> others(8, spec);
   others[0].settings.seed = 1;
   others[1].film.crop.x1 = 32;
   others[2].camera = CameraName{"front"};
   others[3].overrides.sky = Rgb(1, 1, 1);
   others[4].asset_files["a.gltf"] = Sha256().Update("x").Finish();
   others[5].light_units = LightUnits::kRaw;
+  others[6].frames = {0};
+  others[7].settings.filter = PixelFilter::kBox;
   for (const JobSpec& other : others) {
     EXPECT_NE(JobHash(spec), JobHash(other));
     EXPECT_NE(ImageSettingsJson(spec), ImageSettingsJson(other));
   }
+}
+
+TEST(JobHash, OfAFrameKnowsItsTimeAndNotItsNeighbours) {
+  JobSpec spec = SomeSpec(), other = spec;
+  spec.frames = {1, 2, 3};
+  other.frames = {3, 9};
+  EXPECT_EQ(JobHash(SpecOfFrame(spec, 2)), JobHash(SpecOfFrame(other, 0)));
+  EXPECT_NE(JobHash(SpecOfFrame(spec, 1)), JobHash(SpecOfFrame(spec, 2)));
+  other.fps = 25;
+  EXPECT_NE(JobHash(SpecOfFrame(spec, 2)), JobHash(SpecOfFrame(other, 0)));
+  const JobSpec still = SomeSpec();
+  EXPECT_EQ(JobHash(SpecOfFrame(still, 0)), JobHash(still));
 }
 
 }  // namespace

@@ -13,6 +13,7 @@ namespace farpoint {
 namespace {
 
 using std::chrono::milliseconds;
+using testing::ElementsAre;
 using testing::HasSubstr;
 
 // A coordinator in memory that fails where a test wants it to.
@@ -32,6 +33,19 @@ class FakeFarm final : public FarmLink {
   bool damage_always = false;
   int break_after_tiles = -1;  // of the next fetch
   int tiles_sent = 0;
+  int infos = 0;
+  // How many tiles are committed just before an event is sent; see UncommitAll.
+  std::map<uint64_t, uint32_t> commits_before;
+
+  void UncommitAll() {
+    for (TileInfo& tile : job.info.tiles) tile.sha256 = {};
+    job.info.status.state = JobState::kRendering;
+    job.info.status.tiles.committed = job.info.status.frames.done = 0;
+  }
+  void CommitNext() {
+    const uint32_t tile = job.info.status.tiles.committed++;
+    job.info.tiles[tile].sha256 = job.tiles[tile].sha256;
+  }
 
   absl::StatusOr<std::vector<Digest>> FindMissing(std::span<const Digest> asked) override {
     FP_RETURN_IF_ERROR(Next());
@@ -61,19 +75,27 @@ class FakeFarm final : public FarmLink {
     return status;
   }
   absl::Status Cancel(const JobId&) override { return Next(); }
+  absl::Status Pause(const JobId&) override { return Next(); }
+  absl::Status Resume(const JobId&) override { return Next(); }
+  absl::Status SetPriority(const JobId&, int32_t) override { return Next(); }
+  absl::Status Requeue(const JobId&, bool) override { return Next(); }
+  absl::StatusOr<Explanation> Explain(const JobId&) override { return Explanation{}; }
   absl::Status Watch(const JobId&, uint64_t after,
-                     const std::function<void(const JobEvent&)>& on_event) override {
+                     const std::function<absl::Status(const JobEvent&)>& on_event) override {
     watched_after.push_back(after);
     for (const JobEvent& event : events) {
       if (event.sequence != 0 && event.sequence <= after) continue;
       if (stop.raised()) return absl::CancelledError("stop");
-      on_event(event);
+      // What the coordinator knows grows with its events.
+      for (uint32_t i = 0; i < commits_before[event.sequence]; ++i) CommitNext();
+      FP_RETURN_IF_ERROR(on_event(event));
       if (event.sequence % 2 == 0) FP_RETURN_IF_ERROR(Next());
     }
     return absl::OkStatus();
   }
   absl::StatusOr<JobInfo> Info(const JobId&) override {
     FP_RETURN_IF_ERROR(Next());
+    ++infos;
     return job.info;
   }
   absl::Status FetchTiles(const JobId&, std::span<const uint32_t> tiles,
@@ -121,6 +143,31 @@ class JobRunTest : public testing::Test {
     return event;
   }
 
+  // Every frame, as fetch does; their hashes go to `hashes_`.
+  absl::Status FetchAll(bool partial = false) {
+    FP_ASSIGN_OR_RETURN(const JobInfo info, run_.Info(JobId{"1"}));
+    std::vector<uint32_t> frames;
+    for (uint32_t i = 0; i < info.frames.size(); ++i) frames.push_back(i);
+    FP_ASSIGN_OR_RETURN(fetched_, run_.Fetch(info, frames, partial, Sink()));
+    return absl::OkStatus();
+  }
+  FrameSink Sink() {
+    return [this](const JobInfo& info, FetchedFrame frame) {
+      numbers_.push_back(info.frames[frame.frame].number);
+      hashes_.push_back(ImageHash(frame.film));
+      missing_.push_back(frame.missing_tiles);
+      return sink_status_;
+    };
+  }
+  Digest HashOfFrame(uint32_t frame) {
+    return ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty, Layer::kDepth}, frame));
+  }
+
+  size_t fetched_ = 0;
+  std::vector<int32_t> numbers_;
+  std::vector<Digest> hashes_;
+  std::vector<uint32_t> missing_;
+  absl::Status sink_status_;
   StopFlag stop_;
   Console console_{stderr, false, ConsoleLevel::kOff, true};
   FakeFarm farm_{stop_};
@@ -197,38 +244,100 @@ TEST_F(JobRunTest, StopsWaitingWhenASignalComes) {
 }
 
 TEST_F(JobRunTest, FetchesAndStitches) {
-  const auto job = run_.Fetch(JobId{"1"});
-  ASSERT_TRUE(job.ok()) << job.status();
-  EXPECT_EQ(ImageHash(job->film),
-            ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty, Layer::kDepth})));
+  ASSERT_TRUE(FetchAll().ok());
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0)));
   EXPECT_EQ(farm_.tiles_sent, 6);
 }
 
 TEST_F(JobRunTest, FetchesOnlyTheRestAfterABreak) {
   farm_.break_after_tiles = 4;
-  ASSERT_TRUE(run_.Fetch(JobId{"1"}).ok());
+  ASSERT_TRUE(FetchAll().ok());
   EXPECT_EQ(farm_.tiles_sent, 6);
 }
 
 TEST_F(JobRunTest, FetchesADamagedTileAgain) {
   farm_.damage_once = {1, 4};
-  const auto job = run_.Fetch(JobId{"1"});
-  ASSERT_TRUE(job.ok()) << job.status();
+  ASSERT_TRUE(FetchAll().ok());
   EXPECT_EQ(farm_.tiles_sent, 8);
-  EXPECT_EQ(ImageHash(job->film),
-            ImageHash(SampleFilm({0, 0, 96, 64}, {Layer::kBeauty, Layer::kDepth})));
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0)));
 }
 
 TEST_F(JobRunTest, GivesUpOnTilesThatAreAlwaysDamaged) {
   farm_.damage_always = true;
-  const auto job = run_.Fetch(JobId{"1"});
-  EXPECT_TRUE(absl::IsUnavailable(job.status()));
-  EXPECT_THAT(std::string(job.status().message()), HasSubstr("damaged"));
+  const absl::Status status = FetchAll();
+  EXPECT_TRUE(absl::IsUnavailable(status));
+  EXPECT_THAT(std::string(status.message()), HasSubstr("damaged"));
+  EXPECT_TRUE(hashes_.empty());
 }
 
-TEST_F(JobRunTest, DoesNotFetchWhatIsNotDone) {
-  farm_.job.info.status.state = JobState::kRendering;
-  EXPECT_TRUE(absl::IsUnavailable(run_.Fetch(JobId{"1"}).status()));
+TEST_F(JobRunTest, FetchesTheFramesThatAreComplete) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20, 30});
+  farm_.job.info.tiles[7].sha256 = {};
+  ASSERT_TRUE(FetchAll().ok());
+  EXPECT_EQ(fetched_, 2u);
+  EXPECT_THAT(numbers_, ElementsAre(10, 30));
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0), HashOfFrame(2)));
+}
+
+TEST_F(JobRunTest, FetchesWhatIsThereOfTheOthersIfThatIsWanted) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20, 30});
+  farm_.job.info.tiles[7].sha256 = {};
+  for (int tile = 12; tile < 18; ++tile) farm_.job.info.tiles[tile].sha256 = {};
+  ASSERT_TRUE(FetchAll(/*partial=*/true).ok());
+  EXPECT_THAT(numbers_, ElementsAre(10, 20)) << "30 has no tile at all";
+  EXPECT_THAT(missing_, ElementsAre(0u, 1u));
+}
+
+TEST_F(JobRunTest, TheSinksErrorEndsTheFetch) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20, 30});
+  sink_status_ = absl::ResourceExhaustedError("the disk is full");
+  EXPECT_EQ(FetchAll(), sink_status_);
+  EXPECT_THAT(numbers_, ElementsAre(10));
+}
+
+TEST_F(JobRunTest, HandsOnEachFrameWhenItsLastTileIsIn) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20, 30});
+  farm_.UncommitAll();
+  // Six tiles a frame. The first frame is there with event 2, the others with event 4.
+  farm_.commits_before = {{1, 2}, {2, 4}, {3, 3}, {4, 9}};
+  for (uint64_t sequence = 1; sequence <= 5; ++sequence) {
+    JobEvent event = Event(sequence, JobState::kRendering);
+    event.status.frames.done = sequence < 2 ? 0 : sequence < 4 ? 1 : 3;
+    farm_.events.push_back(event);
+  }
+  farm_.events.back().status.state = JobState::kDone;
+  std::vector<uint32_t> committed;
+  const FrameSink record = Sink();
+  const absl::Status status = run_.Wait(JobId{"1"}, [&](const JobInfo& info, FetchedFrame frame) {
+    committed.push_back(info.status.tiles.committed);
+    return record(info, std::move(frame));
+  });
+  ASSERT_TRUE(status.ok()) << status;
+  EXPECT_THAT(numbers_, ElementsAre(10, 20, 30));
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0), HashOfFrame(1), HashOfFrame(2)));
+  EXPECT_EQ(committed.front(), 6u) << "the first frame did not wait for the others";
+  EXPECT_EQ(farm_.tiles_sent, 18) << "each tile once";
+  EXPECT_LE(farm_.infos, 3);
+}
+
+TEST_F(JobRunTest, AFailedSequenceHandsOnWhatIsComplete) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20});
+  farm_.UncommitAll();
+  farm_.commits_before = {{1, 8}};
+  JobEvent failed = Event(1, JobState::kFailed, JobState::kFailed);
+  failed.status.frames.done = 1;
+  failed.status.error = absl::InvalidArgumentError("tile 9 failed");
+  farm_.events = {failed};
+  EXPECT_TRUE(absl::IsInvalidArgument(run_.Wait(JobId{"1"}, Sink())));
+  EXPECT_THAT(numbers_, ElementsAre(10));
+}
+
+TEST_F(JobRunTest, AFullDiskEndsTheWait) {
+  farm_.job = MakeSampleJob({96, 64, {0, 0, 96, 64}}, {10, 20});
+  JobEvent event = Event(1, JobState::kRendering);
+  farm_.events = {event, Event(2, JobState::kDone)};
+  sink_status_ = absl::ResourceExhaustedError("the disk is full");
+  EXPECT_EQ(run_.Wait(JobId{"1"}, Sink()), sink_status_);
 }
 
 TEST(OutcomeOf, IsOkOnlyForADoneJob) {
@@ -239,6 +348,9 @@ TEST(OutcomeOf, IsOkOnlyForADoneJob) {
   EXPECT_TRUE(absl::IsInternal(OutcomeOf(status)));
   status.state = JobState::kBaking;
   EXPECT_THAT(std::string(OutcomeOf(status).message()), HasSubstr("baking"));
+  status.state = JobState::kPaused;
+  EXPECT_TRUE(absl::IsUnavailable(OutcomeOf(status)));
+  EXPECT_THAT(std::string(OutcomeOf(status).message()), HasSubstr("farpoint resume"));
 }
 
 }  // namespace

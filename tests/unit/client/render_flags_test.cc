@@ -46,6 +46,59 @@ TEST(RenderFlags, NamesAreUniqueAndNotAlsoRefused) {
   for (const RefusedFlag& flag : RefusedFlags()) EXPECT_EQ(names.count(flag.name), 0u);
 }
 
+TEST(RenderFlags, SetFilterAndFrames) {
+  const JobSpec spec = Apply({{"--filter", "gaussian"},
+                              {"--filter-width", "2.5"},
+                              {"--frames", "1-10x2,15"},
+                              {"--fps", "23.976"}});
+  EXPECT_EQ(spec.settings.filter, PixelFilter::kGaussian);
+  EXPECT_EQ(spec.settings.filter_width_px, 2.5f);
+  EXPECT_THAT(spec.frames, ElementsAre(1, 3, 5, 7, 9, 15));
+  EXPECT_EQ(spec.fps, 23.976);
+  for (const char* name : {"box", "triangle", "gaussian", "blackman-harris"}) {
+    EXPECT_EQ(NameOf(Apply({{"--filter", name}}).settings.filter), name);
+  }
+  JobSpec file;
+  file.frames = {7};
+  file.fps = 30;
+  EXPECT_THAT(Apply({}, file).frames, ElementsAre(7));
+  EXPECT_THAT(Apply({{"--frames", "2"}}, file).frames, ElementsAre(2));
+  EXPECT_EQ(Apply({{"--frames", "2"}}, file).fps, 30);
+  EXPECT_THAT(Refusal({{"--filter", "mitchell"}}), StartsWith("--filter mitchell: "));
+  EXPECT_THAT(Refusal({{"--filter-width", "17"}}), StartsWith("--filter-width 17: "));
+  EXPECT_THAT(Refusal({{"--filter-width", "nan"}}), StartsWith("--filter-width nan: "));
+  EXPECT_THAT(Refusal({{"--frames", "1-"}}), StartsWith("--frames 1-: "));
+  for (const char* fps : {"0", "-24", "1001", "inf", "film"}) {
+    EXPECT_THAT(Refusal({{"--fps", fps}}), StartsWith(std::string("--fps ") + fps + ": ")) << fps;
+  }
+}
+
+TEST(RenderFlags, SetTheEnvironment) {
+  const JobSpec spec = Apply({{"--env-up", "0,0,2"},
+                              {"--env-scale", "0.5"},
+                              {"--env", "maps/a.exr"},
+                              {"--env-rotation", "-90"}});
+  ASSERT_TRUE(spec.overrides.environment.has_value());
+  EXPECT_EQ(spec.overrides.environment->uri, "maps/a.exr");
+  EXPECT_EQ(spec.overrides.environment->scale, Rgb(0.5f, 0.5f, 0.5f));
+  EXPECT_EQ(spec.overrides.environment->rotation_deg, -90);
+  EXPECT_EQ(spec.overrides.environment->up.z, 2);
+  EXPECT_EQ(Apply({{"--env", "a.exr"}, {"--env-scale", "1,2,3"}}).overrides.environment->scale,
+            Rgb(1, 2, 3));
+  for (const auto& [flag, value] : {GivenFlag{"--env-scale", "2"}, GivenFlag{"--env-rotation", "2"},
+                                    GivenFlag{"--env-up", "0,1,0"}}) {
+    EXPECT_THAT(Refusal({{flag, value}}), AllOf(StartsWith(flag), HasSubstr("--env FILE")));
+    EXPECT_TRUE(Apply({{flag, value}}, spec).overrides.environment.has_value());
+  }
+  const GivenFlag map{"--env", "a.exr"};
+  for (const char* scale : {"-1", "1,2", "1,-2,3", "a", "nan", "1e31"}) {
+    EXPECT_THAT(Refusal({map, {"--env-scale", scale}}), StartsWith("--env-scale ")) << scale;
+  }
+  EXPECT_THAT(Refusal({map, {"--env-up", "0,0,0"}}), HasSubstr("zero"));
+  EXPECT_THAT(Refusal({map, {"--env-rotation", "east"}}), HasSubstr("degrees"));
+  EXPECT_THAT(Refusal({{"--env", ""}}), HasSubstr("file"));
+}
+
 TEST(RenderFlags, SetTheImage) {
   const JobSpec spec = Apply({{"--crop", "10,20,300,200"},
                               {"--resolution", "320x240"},
@@ -250,7 +303,7 @@ TEST(RenderFlagsRefuse, PartsOfACameraThatMakeNoCamera) {
 }
 
 TEST(RenderFlagsRefuse, WhatIsNotBuiltYet) {
-  for (const char* flag : {"--fill", "--quality", "--env"}) {
+  for (const char* flag : {"--fill", "--quality"}) {
     EXPECT_THAT(Refusal({{flag, "x"}}), AllOf(StartsWith(flag), HasSubstr("not built yet")));
   }
 }
@@ -259,8 +312,8 @@ TEST(CheckScenePath, KnowsItsExtensions) {
   EXPECT_TRUE(CheckScenePath("a/b.gltf").ok());
   EXPECT_TRUE(CheckScenePath("B.GLB").ok());
   EXPECT_TRUE(CheckScenePath("job.json").ok());
-  EXPECT_THAT(std::string(CheckScenePath("a.obj").message()), HasSubstr("not built yet"));
-  EXPECT_THAT(std::string(CheckScenePath("a.ply").message()), HasSubstr("not built yet"));
+  EXPECT_THAT(std::string(CheckScenePath("a.xyz").message()),
+              AllOf(HasSubstr("a.xyz"), HasSubstr(".gltf"), HasSubstr("job file .json")));
   EXPECT_THAT(std::string(CheckScenePath("a.fbx").message()), HasSubstr(".gltf, .glb"));
   EXPECT_FALSE(CheckScenePath("gltf").ok());
 }

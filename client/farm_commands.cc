@@ -1,0 +1,238 @@
+#include "client/farm_commands.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include <map>
+#include <memory>
+#include <set>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "client/exit_code.h"
+#include "client/image_writer.h"
+#include "client/job_run.h"
+#include "client/reports.h"
+
+namespace farpoint {
+namespace {
+
+constexpr std::chrono::milliseconds kPollPeriod(500);
+
+absl::StatusOr<JobStatus> StatusOf(FarmSession& session, const JobId& job) {
+  FP_ASSIGN_OR_RETURN(FarmStatus status,
+                      session.retry.Get<FarmStatus>([&] { return session.farm.Status(job); }));
+  if (status.jobs.size() == 1) return std::move(status.jobs[0]);
+  return absl::InternalError("the coordinator says nothing about job " + job.value);
+}
+
+// One named job is an object, all else an array.
+absl::Status WriteJobs(const CommandLine& line, const std::vector<JobStatus>& jobs) {
+  if (line.json.empty()) return absl::OkStatus();
+  const bool one = line.jobs.size() == 1 && jobs.size() == 1;
+  return WriteText(line.json, one ? JobStatusJson(jobs[0]) : JobsJson(jobs));
+}
+
+// Remembers which of several errors is to be returned and shows the others.
+class Errors {
+ public:
+  explicit Errors(Console& console) : console_(console) {}
+
+  void Add(const absl::Status& status) {
+    if (status.ok()) return;
+    const bool worse =
+        worst_.ok() || (ExitCodeOf(worst_) == kExitTryAgain && ExitCodeOf(status) != kExitTryAgain);
+    const absl::Status shown = worse ? worst_ : status;
+    if (worse) worst_ = status;
+    if (!shown.ok()) console_.Error(std::string(shown.message()));
+  }
+  const absl::Status& worst() const { return worst_; }
+
+ private:
+  Console& console_;
+  absl::Status worst_;
+};
+
+absl::Status Tell(FarmSession& session, const JobId& job) {
+  switch (session.line.verb) {
+    case Verb::kPause:
+      return session.farm.Pause(job);
+    case Verb::kResume:
+      return session.farm.Resume(job);
+    case Verb::kRequeue:
+      return session.farm.Requeue(job, session.line.all);
+    case Verb::kPriority:
+      return session.farm.SetPriority(job, *session.line.priority);
+    default:
+      return session.farm.Cancel(job);
+  }
+}
+
+// A stream of lines to stdout or a file.
+class LineOutput {
+ public:
+  static absl::StatusOr<LineOutput> Open(const std::string& file) {
+    if (file.empty() || file == "-") return LineOutput(stdout, false);
+    std::FILE* stream = std::fopen(file.c_str(), "w");
+    if (stream == nullptr) {
+      return absl::UnavailableError("--json " + file + ": cannot be written; choose another file");
+    }
+    return LineOutput(stream, true);
+  }
+  absl::Status Write(const std::string& line) {
+    const std::string text = line + "\n";
+    // At once: the reader may follow.
+    if (std::fwrite(text.data(), 1, text.size(), stream_.get()) == text.size() &&
+        std::fflush(stream_.get()) == 0) {
+      return absl::OkStatus();
+    }
+    return absl::ResourceExhaustedError("the log cannot be written; is the disk full?");
+  }
+
+ private:
+  LineOutput(std::FILE* stream, bool owned)
+      : stream_(
+            stream, owned ? [](std::FILE* file) { std::fclose(file); } : [](std::FILE*) {}) {}
+
+  std::unique_ptr<std::FILE, void (*)(std::FILE*)> stream_;
+};
+
+// Several jobs at once, by asking again and again.
+absl::StatusOr<std::vector<JobStatus>> WatchSeveral(FarmSession& session, std::set<JobId> jobs) {
+  std::map<JobId, JobStatus> ended;
+  while (true) {
+    FP_ASSIGN_OR_RETURN(const FarmStatus status, session.retry.Get<FarmStatus>(
+                                                     [&] { return session.farm.Status(JobId{}); }));
+    std::set<JobId> found;
+    for (const JobStatus& job : status.jobs) {
+      if (!jobs.contains(job.id)) continue;
+      found.insert(job.id);
+      session.console.Report(job);
+      if (IsFinal(job.state)) ended[job.id] = job;
+    }
+    for (const JobId& job : jobs) {
+      if (found.contains(job) || ended.contains(job)) continue;
+      return absl::NotFoundError(
+          "job " + job.value + " is not known to the coordinator; farpoint status lists the jobs");
+    }
+    if (ended.size() == jobs.size()) break;
+    if (!session.stop.SleepFor(kPollPeriod)) return absl::CancelledError("stopped by a signal");
+  }
+  std::vector<JobStatus> statuses;
+  for (auto& [id, status] : ended) statuses.push_back(std::move(status));
+  return statuses;
+}
+
+}  // namespace
+
+absl::Status RunStatus(FarmSession session) {
+  const JobId job{session.line.jobs.empty() ? std::string() : session.line.jobs[0]};
+  FP_ASSIGN_OR_RETURN(const FarmStatus status,
+                      session.retry.Get<FarmStatus>([&] { return session.farm.Status(job); }));
+  if (session.line.json.empty()) return WriteText("-", FarmStatusText(status));
+  if (job.empty()) return WriteText(session.line.json, FarmStatusJson(status));
+  if (status.jobs.size() != 1) {
+    return absl::InternalError("the coordinator says nothing about job " + job.value);
+  }
+  return WriteText(session.line.json, JobStatusJson(status.jobs[0]));
+}
+
+absl::Status RunWorkers(FarmSession session) {
+  FP_ASSIGN_OR_RETURN(const FarmStatus status,
+                      session.retry.Get<FarmStatus>([&] { return session.farm.Status(JobId{}); }));
+  if (!session.line.json.empty()) return WriteText(session.line.json, WorkersJson(status.workers));
+  return WriteText("-", WorkersText(status.workers));
+}
+
+absl::Status RunControl(FarmSession session) {
+  Errors errors(session.console);
+  std::vector<JobStatus> statuses;
+  for (const std::string& id : session.line.jobs) {
+    const JobId job{id};
+    const absl::Status told = session.retry.Run([&] { return Tell(session, job); });
+    if (session.stop.raised()) return told;
+    if (!told.ok()) {
+      errors.Add(told);
+      continue;
+    }
+    // What came of it: pausing a job that is done leaves it done.
+    FP_ASSIGN_OR_RETURN(JobStatus status, StatusOf(session, job));
+    session.console.Info("job " + id + " is " + std::string(NameOf(status.state)) +
+                         (session.line.verb == Verb::kPriority
+                              ? ", its priority " + std::to_string(status.priority)
+                              : std::string()));
+    statuses.push_back(std::move(status));
+  }
+  FP_RETURN_IF_ERROR(WriteJobs(session.line, statuses));
+  return errors.worst();
+}
+
+absl::Status RunWatch(FarmSession session) {
+  std::set<JobId> jobs;
+  for (const std::string& id : session.line.jobs) jobs.insert(JobId{id});
+  if (jobs.empty()) {
+    FP_ASSIGN_OR_RETURN(const FarmStatus status, session.retry.Get<FarmStatus>(
+                                                     [&] { return session.farm.Status(JobId{}); }));
+    for (const JobStatus& job : status.jobs) {
+      if (!IsFinal(job.state)) jobs.insert(job.id);
+    }
+    if (jobs.empty()) {
+      session.console.Info("every job has ended");
+      return WriteJobs(session.line, {});
+    }
+  }
+  if (jobs.size() == 1) {
+    const JobId& job = *jobs.begin();
+    JobRun run(session.farm, session.retry, session.stop, session.console);
+    const absl::Status outcome = run.Wait(job);
+    if (session.stop.raised()) return outcome;
+    // A coordinator that was lost, or an id that it does not know, has no status to write either.
+    const auto status = StatusOf(session, job);
+    if (!status.ok()) return outcome.ok() ? status.status() : outcome;
+    FP_RETURN_IF_ERROR(WriteJobs(session.line, {*status}));
+    if (outcome.ok()) session.console.Info("job " + job.value + " is done");
+    return outcome;
+  }
+  FP_ASSIGN_OR_RETURN(const std::vector<JobStatus> ended, WatchSeveral(session, jobs));
+  FP_RETURN_IF_ERROR(WriteJobs(session.line, ended));
+  Errors errors(session.console);
+  for (const JobStatus& job : ended) errors.Add(OutcomeOf(job));
+  return errors.worst();
+}
+
+absl::Status RunLogs(FarmSession session) {
+  const JobId job{session.line.jobs[0]};
+  const bool json = !session.line.json.empty();
+  FP_ASSIGN_OR_RETURN(LineOutput output, LineOutput::Open(session.line.json));
+  uint64_t last_sequence = 0;
+  bool caught_up = false;
+  const absl::Status status = session.retry.Run([&] {
+    return session.farm.Watch(job, last_sequence, [&](const JobEvent& event) -> absl::Status {
+      session.retry.Succeeded();
+      if (event.sequence == 0) {
+        // A passing report comes only when nothing else is to be told.
+        caught_up = true;
+        return session.line.follow ? absl::OkStatus() : absl::AbortedError("caught up");
+      }
+      last_sequence = event.sequence;
+      return output.Write(json ? LogJson(event) : LogText(event));
+    });
+  });
+  if (caught_up && absl::IsAborted(status)) return absl::OkStatus();
+  return status;
+}
+
+absl::Status RunExplain(FarmSession session) {
+  const JobId job{session.line.jobs[0]};
+  FP_ASSIGN_OR_RETURN(const Explanation explanation,
+                      session.retry.Get<Explanation>([&] { return session.farm.Explain(job); }));
+  if (!session.line.json.empty()) {
+    return WriteText(session.line.json, ExplanationJson(job, explanation));
+  }
+  std::string text;
+  for (const std::string& line : explanation.lines) text += line + "\n";
+  return WriteText("-", text);
+}
+
+}  // namespace farpoint
