@@ -24,6 +24,18 @@ bool ParseResolution(std::string_view text, int& width, int& height) {
   return y_error == std::errc() && y == end && width > 0 && height > 0;
 }
 
+// "1,0.5,2": three finite numbers.
+bool ParseVec3(std::string_view text, Vec3d& out) {
+  const char* at = text.data();
+  const char* const end = at + text.size();
+  for (int i = 0; i < 3; ++i) {
+    const auto [next, error] = std::from_chars(at, end, out[i]);
+    if (error != std::errc() || (i < 2 && (next == end || *next != ','))) return false;
+    at = i < 2 ? next + 1 : next;
+  }
+  return at == end && IsFinite(out);
+}
+
 void AddCommonOptions(CLI::App& app, std::string& output_dir, bool& quick) {
   app.add_option("-o,--output", output_dir, "Folder of the results; made if it is not there")
       ->capture_default_str();
@@ -37,7 +49,8 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   line.output_dir = "out/bench";
   if (!args.empty() &&
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
-    return absl::UnimplementedError("'" + args.front() + "' is not built yet; use pareto or micro");
+    return absl::UnimplementedError("'" + args.front() +
+                                    "' is not built yet; use pareto, rebake or micro");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -85,12 +98,42 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   AddCommonOptions(*micro, line.output_dir, line.micro.quick);
   micro->add_option("--filter", line.micro.filter, "Only names that match this regular expression");
 
+  RebakeOptions& r = line.rebake;
+  std::string sun, sky;
+  CLI::App* rebake = app.add_subcommand(
+      "rebake", "Bakes after a change of camera, light, material or object; writes rebake.json");
+  AddCommonOptions(*rebake, line.output_dir, r.quick);
+  rebake->add_option("--scene", r.scene, "cornell, city, furnace or a scene file")
+      ->capture_default_str();
+  rebake->add_option("--sun", sun, "x,y,z:r,g,b: a sun in place of the scene's punctual lights");
+  rebake->add_option("--sky", sky, "r,g,b: a constant sky in place of the scene's");
+  rebake->add_option("--points", r.points, "Surfels [by the scene, quick: 20000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  rebake->add_option("--light-samples", r.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  rebake->add_option("--seed", r.seed, "Of every random choice")->capture_default_str();
+  rebake->add_option("--object", r.object, "Index of the instance that moves [the last]");
+  rebake->add_option("--repeat", r.repeat, "Bakes of each kind; the median counts")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 1000));
+  rebake->add_option("--threads", r.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+  uint64_t cache_mib = r.cache_bytes >> 20;
+  rebake->add_option("--cache-mib", cache_mib, "Limit of the cache")
+      ->capture_default_str()
+      ->check(CLI::Range(uint64_t{0}, uint64_t{1} << 24));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
     app.parse(args);
   } catch (const CLI::CallForHelp&) {
-    const CLI::App* asked = pareto->parsed() ? pareto : micro->parsed() ? micro : &app;
+    const CLI::App* asked = pareto->parsed()   ? pareto
+                            : micro->parsed()  ? micro
+                            : rebake->parsed() ? rebake
+                                               : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
   } catch (const CLI::CallForVersion& version) {
@@ -99,7 +142,27 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   } catch (const CLI::ParseError& error) {
     return absl::InvalidArgumentError(std::string(error.what()) + "; see farpoint-bench --help");
   }
-  line.verb = pareto->parsed() ? BenchVerb::kPareto : BenchVerb::kMicro;
+  line.verb = pareto->parsed()   ? BenchVerb::kPareto
+              : rebake->parsed() ? BenchVerb::kRebake
+                                 : BenchVerb::kMicro;
+  r.cache_bytes = cache_mib << 20;
+  if (!sun.empty()) {
+    const size_t colon = sun.find(':');
+    Vec3d to_sun, irradiance;
+    if (colon == std::string::npos || !ParseVec3(sun.substr(0, colon), to_sun) ||
+        !ParseVec3(sun.substr(colon + 1), irradiance) || MaxAbs(to_sun) == 0) {
+      return absl::InvalidArgumentError("--sun " + sun + " is not x,y,z:r,g,b");
+    }
+    r.to_sun = to_sun;
+    r.sun = Rgb(irradiance);
+  }
+  if (!sky.empty()) {
+    Vec3d radiance;
+    if (!ParseVec3(sky, radiance)) {
+      return absl::InvalidArgumentError("--sky " + sky + " is not r,g,b");
+    }
+    r.sky = Rgb(radiance);
+  }
   if (resolution_option->count() > 0 && !ParseResolution(resolution, p.width, p.height)) {
     return absl::InvalidArgumentError("--resolution " + resolution +
                                       " is not WIDTHxHEIGHT in pixels, such as 640x480");

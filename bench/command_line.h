@@ -7,17 +7,19 @@
 
 #include "bench/micro.h"
 #include "bench/pareto.h"
+#include "bench/rebake.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro };
+enum class BenchVerb { kPareto, kMicro, kRebake };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
   BenchVerb verb = BenchVerb::kPareto;
   std::string output_dir;
   ParetoOptions pareto;
+  RebakeOptions rebake;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -95,16 +95,18 @@ void MakeViews(MicroWorkload& work) {
 
 absl::StatusOr<std::unique_ptr<MicroWorkload>> MicroWorkload::Make(bool quick) {
   auto work = std::make_unique<MicroWorkload>();
-  const Scene scene = MakeCornellBox();
+  work->description = MakeCornellBox();
+  const Scene& scene = work->description;
   FP_ASSIGN_OR_RETURN(work->scene, PreparedScene::Prepare(scene, work->executor));
   FP_ASSIGN_OR_RETURN(work->accel, RayAccel::Build(work->scene));
   work->lights = std::make_unique<LightSampler>(work->accel);
   work->surfel_count = quick ? 5'000 : 100'000;
   work->shade.seed = kSeed;
-  work->cloud = SampleSurfels(*work->scene, work->surfel_count, kSeed, work->executor);
+  work->cloud = SampleSurfels(scene, *work->scene, work->surfel_count, kSeed, work->executor);
   Stats stats;
-  work->shading =
-      ShadeSurfels(work->cloud, *work->accel, *work->lights, work->shade, work->executor, stats);
+  work->open_sides = FindOpenSides(work->cloud, *work->accel, kSeed, work->executor, stats);
+  work->shading = ShadeSurfels(work->cloud, work->open_sides, *work->accel, *work->lights,
+                               work->shade, work->executor, stats);
   work->blobs = PointTree::Build(work->cloud, work->shading, work->executor);
   FP_ASSIGN_OR_RETURN(work->tree, PointTree::FromBlobs(work->blobs.topology, work->blobs.radiance));
   TraceBlock(scene.cameras.front(), quick ? 64 : 256, *work);

@@ -40,10 +40,12 @@ struct MicroWorkload {
   Executor executor{1};
   uint64_t surfel_count = 0;  // asked for
   ShadeOptions shade;
+  Scene description;
   std::shared_ptr<const PreparedScene> scene;
   std::shared_ptr<const RayAccel> accel;
   std::unique_ptr<const LightSampler> lights;
   SurfelCloud cloud;
+  SurfelSides open_sides;
   SurfelShading shading;
   PointTree::Blobs blobs;
   std::shared_ptr<const PointTree> tree;

@@ -43,6 +43,16 @@ absl::Status Pareto(const BenchCommandLine& line, std::ostream& out, std::ostrea
   return absl::OkStatus();
 }
 
+absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  const std::filesystem::path path = std::filesystem::path(line.output_dir) / "rebake.json";
+  FP_RETURN_IF_ERROR(WriteText(path, RebakeJson(report)));
+  out << RebakeTable(report) << "\n" << path.string() << "\n";
+  return absl::OkStatus();
+}
+
 absl::Status Micro(const BenchCommandLine& line, std::ostream& out) {
   MicroOptions options = line.micro;
   options.json_path = (std::filesystem::path(line.output_dir) / "micro.json").string();
@@ -58,7 +68,15 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
     return absl::InvalidArgumentError(line.output_dir + ": cannot be made: " + error.message() +
                                       "; name another folder with -o");
   }
-  return line.verb == BenchVerb::kPareto ? Pareto(line, out, err) : Micro(line, out);
+  switch (line.verb) {
+    case BenchVerb::kPareto:
+      return Pareto(line, out, err);
+    case BenchVerb::kRebake:
+      return Rebake(line, out, err);
+    case BenchVerb::kMicro:
+      return Micro(line, out);
+  }
+  return absl::OkStatus();
 }
 
 }  // namespace

@@ -17,6 +17,7 @@
 #include <span>
 #include <vector>
 
+#include "core/base/aligned.h"
 #include "core/base/blob.h"
 #include "core/base/executor.h"
 #include "core/base/status.h"
@@ -34,7 +35,7 @@ struct alignas(32) NodeGroup {
   float nx[kLanes], ny[kLanes], nz[kLanes];  // Σ A n / Σ A: as short as the normals spread
   float sin_cone[kLanes];    // sine of the largest angle to the mean normal; 1: 90° or more
   float area[kLanes];        // Σ A, m²
-  float front_area[kLanes];  // Σ A of surfels whose front is visible
+  float front_area[kLanes];  // Σ A of surfels whose front is visible (in the topology blob: open)
   float back_area[kLanes];   // Σ A of surfels whose back is visible
 };
 static_assert(sizeof(NodeGroup) == 384);
@@ -53,14 +54,33 @@ class PointTree {
   struct Blobs {
     Blob topology, radiance;
   };
+  // What does not depend on the lights: where the surfels stand in the tree, and the nodes.
+  struct Topology {
+    Blob blob;
+    std::vector<uint32_t> order;  // by slot of level 0: the surfel that it holds
+  };
 
-  // Sorts, builds and serialises. Takes O(n log n) for the sort and O(n) for the rest; the result
-  // does not depend on the number of threads. An empty cloud gives a tree without levels.
+  // Sorts, builds and serialises, in O(n). `open_sides` are the sides that are visible whatever
+  // the lights. The result does not depend on the number of threads. An empty cloud gives a tree
+  // without levels.
+  static Topology BuildTopology(const SurfelCloud& cloud, const SurfelSides& open_sides,
+                                Executor& executor);
+  // The radiance that belongs to a topology of `cloud` and `open_sides`. Sides that are visible
+  // (shading.visible_sides) but not open go by name into this blob, so that the topology stays what
+  // it is when the lights change. An open side is always visible.
+  static Blob BuildRadiance(const Topology& topology, const SurfelCloud& cloud,
+                            const SurfelSides& open_sides, const SurfelShading& shading,
+                            Executor& executor);
+  // Both, where all visible sides are open.
   static Blobs Build(const SurfelCloud& cloud, const SurfelShading& shading, Executor& executor);
 
-  // Views the blobs in place. kDataLoss unless every size, count and value is as Build makes them:
-  // finite, radii and areas >= 0, levels that fit. The two must belong together.
+  // Views the blobs in place; the nodes are copied if sides are visible that are not open.
+  // kDataLoss unless every size, count and value is as Build makes them: finite, radii and
+  // areas >= 0, levels that fit. The two must belong together.
   static absl::StatusOr<std::shared_ptr<const PointTree>> FromBlobs(Blob topology, Blob radiance);
+
+  // Nodes of all levels of a tree over `surfels`, surfels included.
+  static uint64_t NodeCount(uint64_t surfels);
 
   uint64_t surfel_count() const { return surfel_count_; }
   uint64_t node_count() const { return node_count_; }  // all levels, surfels included
@@ -79,10 +99,16 @@ class PointTree {
   uint32_t first_group(int level) const { return first_group_[level]; }
   // Whether any surfel reflects anything.
   bool lit() const { return lit_; }
-  size_t size_bytes() const { return topology_.size() + radiance_blob_.size(); }
+  size_t size_bytes() const {
+    return topology_.size() + radiance_blob_.size() + own_groups_.size() * sizeof(NodeGroup);
+  }
 
  private:
+  // Makes sides visible that are not open: entries slot * 2 + (0 front, 1 back), ascending.
+  absl::Status AddVisible(std::span<const uint32_t> lit_sides);
+
   Blob topology_, radiance_blob_;
+  AlignedVector<NodeGroup> own_groups_;  // if they differ from the blob's
   uint64_t surfel_count_ = 0, node_count_ = 0;
   std::vector<uint32_t> first_group_;  // by level
   std::span<const NodeGroup> groups_;

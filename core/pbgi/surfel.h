@@ -24,10 +24,13 @@ struct SurfelCloud {
 // a second, dark layer behind the visible front: it is left out of the gather.
 enum SurfelSide : uint8_t { kFrontVisible = 1, kBackVisible = 2 };
 
+// SurfelSide bits of every surfel of a cloud.
+using SurfelSides = std::vector<uint8_t>;
+
 // What the surfels reflect. All of one length, parallel to a SurfelCloud.
 struct SurfelShading {
   std::vector<Rgb> front, back;  // reflected radiance, W/(m² sr), diffuse: the same all round
-  std::vector<uint8_t> visible_sides;  // SurfelSide bits
+  SurfelSides visible_sides;     // those that are open, and those that a light reaches
 };
 
 }  // namespace farpoint

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "core/base/check.h"
 #include "core/math/elementary.h"
 #include "core/math/sampling.h"
 
@@ -15,6 +16,14 @@ constexpr size_t kPiece = 1024;
 struct PieceCounts {
   uint64_t shadow = 0, interior = 0, inside = 0, black = 0;
 };
+
+// Seeds a surfel's rays by what it is, not by where it stands in the cloud.
+uint64_t KeyOf(const SurfelCloud& cloud, size_t i, const PreparedScene& scene, uint64_t seed) {
+  const uint32_t t = cloud.triangle[i];
+  const PreparedObject& object = scene.objects()[scene.triangles()[t].object];
+  return HashKey(seed, object.content_key, t - object.first_triangle,
+                 static_cast<uint64_t>(cloud.barycentric[i].x * 16777216.0f));
+}
 
 // Whether all rays that leave `p` on the side of `ng` hit surfaces from behind.
 bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, uint64_t key,
@@ -33,11 +42,36 @@ bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, u
 
 }  // namespace
 
-SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
-                           const LightSampler& lights, const ShadeOptions& options,
-                           Executor& executor, Stats& stats) {
+SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint64_t seed,
+                          Executor& executor, Stats& stats) {
+  const size_t n = cloud.size();
+  SurfelSides sides(n);
+  std::vector<PieceCounts> piece_counts((n + kPiece - 1) / kPiece);
+  executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
+    PieceCounts& counts = piece_counts[begin / kPiece];
+    for (size_t i = begin; i < end; ++i) {
+      const uint64_t key = KeyOf(cloud, i, accel.scene(), seed);
+      uint8_t open = 0;
+      for (unsigned side = 0; side < 2; ++side) {
+        const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
+        if (!SeesOnlyBackFaces(accel, cloud.position[i], ng, HashKey(HashKey(key, side), 5),
+                               counts)) {
+          open |= side == 0 ? kFrontVisible : kBackVisible;
+        }
+      }
+      sides[i] = open;
+    }
+  });
+  for (const PieceCounts& c : piece_counts) stats.counts["interior_rays"] += c.interior;
+  return sides;
+}
+
+SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sides,
+                           const RayAccel& accel, const LightSampler& lights,
+                           const ShadeOptions& options, Executor& executor, Stats& stats) {
   const PreparedScene& scene = accel.scene();
   const size_t n = cloud.size();
+  FP_CHECK(open_sides.size() == n);
   SurfelShading out;
   out.front.resize(n);
   out.back.resize(n);
@@ -56,25 +90,21 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
       const Rgb albedo = scene.Surface(t, b.x, b.y).albedo;
       const Vec3f ns_front = scene.ShadingNormal(t, b.x, b.y);
       const bool black = !(MaxComponent(albedo) > 0.0f);
-      // Seeded by what the surfel is, not by where it stands in the cloud.
-      const uint64_t key =
-          HashKey(options.seed, scene.objects()[scene.triangles()[t].object].content_key,
-                  t - scene.objects()[scene.triangles()[t].object].first_triangle,
-                  static_cast<uint64_t>(b.x * 16777216.0f));
-      uint8_t visible = 0;
-      for (int side = 0; side < 2; ++side) {
+      const uint64_t key = KeyOf(cloud, i, scene, options.seed);
+      uint8_t visible = open_sides[i];
+      for (unsigned side = 0; side < 2; ++side) {
+        const uint8_t bit = side == 0 ? kFrontVisible : kBackVisible;
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
         const Vec3f ns = side == 0 ? ns_front : -ns_front;
-        const uint64_t side_key = HashKey(key, static_cast<uint64_t>(side));
-        const bool inside = SeesOnlyBackFaces(accel, p, ng, HashKey(side_key, 5), counts);
-        if (inside) {
+        const uint64_t side_key = HashKey(key, side);
+        if ((visible & bit) == 0) {
           const Rgb probe = lights.Irradiance(p, ng, ns, 1, side_key, 0, 0, light_counters);
           if (!(MaxComponent(probe) > 0.0f)) {
             ++counts.inside;
             continue;
           }
+          visible |= bit;
         }
-        visible |= side == 0 ? kFrontVisible : kBackVisible;
         if (black && !options.no_skip) {
           ++counts.black;
           continue;
@@ -88,7 +118,6 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
   });
   for (const PieceCounts& c : piece_counts) {
     stats.counts["shadow_rays"] += c.shadow;
-    stats.counts["interior_rays"] += c.interior;
     stats.skipped["surfel_sides_inside"] += c.inside;
     stats.skipped["surfel_sides_black"] += c.black;
   }

@@ -18,13 +18,19 @@ struct ShadeOptions {
 // A gather averages many surfels, so each takes a quarter of a receiver's shadow rays.
 inline constexpr uint32_t kSurfelLightShare = 4;
 
-// Both sides of every surfel: radiance = albedo / pi * E. Which sides are visible is decided by
-// four rays that leave the side: if all of them hit back faces, and no light reaches the side, it
-// lies inside a closed object. Surfels are independent of each other: any number of threads gives
-// the same result. Adds counts "shadow_rays", "interior_rays" and skipped "surfel_sides_inside",
-// "surfel_sides_black" to `stats`.
-SurfelShading ShadeSurfels(const SurfelCloud& cloud, const RayAccel& accel,
-                           const LightSampler& lights, const ShadeOptions& options,
-                           Executor& executor, Stats& stats);
+// The sides that are open: not inside a closed object as far as four rays that leave the side tell
+// (all of them hit back faces). A matter of geometry alone, whatever the lights. Surfels are
+// independent of each other: any number of threads gives the same result. Adds the count
+// "interior_rays" to `stats`.
+SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint64_t seed,
+                          Executor& executor, Stats& stats);
+
+// Both sides of every surfel: radiance = albedo / pi * E. Visible are the sides that are open and
+// those that a probe of the lights reaches all the same. Surfels are independent of each other.
+// Adds the count "shadow_rays" and skipped "surfel_sides_inside" and "surfel_sides_black" to
+// `stats`.
+SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sides,
+                           const RayAccel& accel, const LightSampler& lights,
+                           const ShadeOptions& options, Executor& executor, Stats& stats);
 
 }  // namespace farpoint

@@ -1,6 +1,10 @@
 #include "core/render/bake.h"
 
 #include <chrono>
+#include <memory>
+#include <span>
+#include <string_view>
+#include <vector>
 
 #include "core/accel/ray_accel.h"
 #include "core/base/clock.h"
@@ -36,14 +40,246 @@ class StageTimer {
   double cpu_;
 };
 
+// A tree's topology with what shading anew needs of it.
+struct BakedTopology {
+  PointTree::Topology topology;
+  SurfelSides open_sides;
+
+  uint64_t size_bytes() const {
+    return topology.blob.size() + topology.order.size() * sizeof(uint32_t) + open_sides.size();
+  }
+};
+
+struct BakedRadiance {
+  Blob blob;
+  uint64_t surfels = 0;
+};
+
+template <typename T>
+void HashArray(Sha256& hash, std::span<const T> values) {
+  hash.UpdateU64(values.size());
+  hash.Update(std::as_bytes(values));
+}
+void HashDigest(Sha256& hash, const Digest& digest) {
+  hash.Update(std::as_bytes(std::span(digest.bytes)));
+}
+
+// All that decides which triangle, if any, a ray meets, and by which keys surfels seed theirs.
+Digest GeometryKey(const Scene& scene, const PreparedScene& prepared) {
+  Sha256 hash;
+  hash.Update("geometry");
+  HashArray(hash, prepared.vertices());
+  HashArray(hash, prepared.triangles());
+  bool masked = false;
+  for (size_t o = 0; o < prepared.objects().size(); ++o) {
+    const PreparedObject& object = prepared.objects()[o];
+    hash.UpdateU64(object.first_triangle).UpdateU64(object.content_key);
+    const PreparedMaterial& material = prepared.materials()[object.material];
+    if (material.alpha_cutoff < 0) continue;
+    masked = true;
+    HashArray(hash, std::span(&material.alpha_cutoff, 1));
+    HashArray(hash, std::span(&material.base_alpha, 1));
+    hash.UpdateU32(material.base_color_uv_set);
+    HashArray(hash, std::span<const float>(material.base_color_uv));
+    if (material.base_color_texture < 0) continue;
+    const PreparedTexture& t =
+        prepared.textures()[static_cast<size_t>(material.base_color_texture)];
+    hash.UpdateU32(t.wrap_s).UpdateU32(t.wrap_t).UpdateU32(t.nearest);
+    // The texels by the file that they are decoded from.
+    const Mesh& mesh = scene.meshes[scene.instances[prepared.object_instances()[o]].mesh];
+    const TextureRef& ref = scene.materials[static_cast<size_t>(mesh.material)].base_color_texture;
+    HashArray(hash, scene.textures[static_cast<size_t>(ref.texture)].encoded.bytes());
+  }
+  if (masked) {
+    for (unsigned set = 0; set < 2; ++set) HashArray(hash, prepared.uvs(set));
+  }
+  return hash.Finish();
+}
+
+float SpacingFor(const RenderSettings& settings, double area_m2, float diagonal_m) {
+  return settings.points != 0 ? SurfelSpacingM(area_m2, settings.points)
+                              : DefaultSurfelSpacingM(area_m2, diagonal_m);
+}
+
+// The stages after the prepared scene.
+class TreeBake {
+ public:
+  TreeBake(const Scene& scene, std::shared_ptr<const PreparedScene> prepared,
+           const RenderSettings& settings, const BakeOptions& options, Executor& executor,
+           Stats& stats)
+      : scene_(scene),
+        prepared_(std::move(prepared)),
+        settings_(settings),
+        options_(options),
+        cache_(settings.no_skip ? nullptr : options.cache),
+        executor_(executor),
+        stats_(stats) {}
+
+  absl::Status Run(BakedScene& baked) {
+    FindKeys();
+    std::shared_ptr<const BakedTopology> topology;
+    std::shared_ptr<const BakedRadiance> radiance;
+    if (cache_ != nullptr) {
+      topology = cache_->Find<BakedTopology>(topology_key_);
+      radiance = cache_->Find<BakedRadiance>(radiance_key_);
+    }
+    if (topology != nullptr && radiance != nullptr) {
+      stats_.skipped["bake_stages"] += 3;
+      stats_.skipped["objects_kept"] += shapes_.size();
+      stats_.skipped["surfels_kept"] += radiance->surfels;
+      stats_.skipped["surfels_shaded_kept"] += radiance->surfels;
+    } else {
+      FP_RETURN_IF_ERROR(Build(topology, radiance));
+    }
+    baked.tree_topology = topology->topology.blob;
+    baked.tree_radiance = radiance->blob;
+    stats_.counts["surfels"] = radiance->surfels;
+    stats_.counts["nodes"] = PointTree::NodeCount(radiance->surfels);
+    stats_.bytes["tree"] = baked.tree_topology.size() + baked.tree_radiance.size();
+    return absl::OkStatus();
+  }
+
+ private:
+  absl::Status CheckNotStopped() const {
+    if (options_.cancel != nullptr && options_.cancel->load()) {
+      return absl::CancelledError("the bake was stopped");
+    }
+    return absl::OkStatus();
+  }
+
+  void FindKeys() {
+    StageTimer timer(stats_, Stage::kSample);
+    shapes_ = MakeObjectShapes(scene_, *prepared_, executor_);
+    spacing_m_ = options_.surfel_spacing_m > 0
+                     ? options_.surfel_spacing_m
+                     : SpacingFor(settings_, TotalAreaM2(shapes_), prepared_->diagonal_m());
+    if (spacing_m_ > 0) {
+      samplers_.resize(shapes_.size());
+      executor_.ForEach(shapes_.size(), 1, [&](size_t i) {
+        samplers_[i] = std::make_unique<ObjectSampler>(shapes_[i], *prepared_, i, spacing_m_,
+                                                       settings_.seed, executor_);
+      });
+    }
+    if (cache_ == nullptr) return;
+    Sha256 topology;
+    topology.Update("topology").UpdateU64(settings_.seed).UpdateU64(samplers_.size());
+    for (const auto& sampler : samplers_) HashDigest(topology, sampler->key());
+    HashDigest(topology, GeometryKey(scene_, *prepared_));
+    topology_key_ = topology.Finish();
+    Sha256 radiance;
+    radiance.Update("radiance").UpdateU64(settings_.seed).UpdateU32(settings_.light_samples);
+    HashDigest(radiance, topology_key_);
+    HashDigest(radiance, prepared_->blob().Hash());
+    radiance_key_ = radiance.Finish();
+  }
+
+  absl::Status Build(std::shared_ptr<const BakedTopology>& topology,
+                     std::shared_ptr<const BakedRadiance>& radiance) {
+    FP_RETURN_IF_ERROR(CheckNotStopped());
+    std::shared_ptr<const RayAccel> accel;
+    std::unique_ptr<const LightSampler> lights;
+    {
+      StageTimer timer(stats_, Stage::kImport);
+      FP_ASSIGN_OR_RETURN(accel, RayAccel::Build(prepared_));
+      lights = std::make_unique<const LightSampler>(accel);
+    }
+    SurfelCloud cloud;
+    const bool lit = lights->any_light() || settings_.no_skip;
+    if (lit) {
+      StageTimer timer(stats_, Stage::kSample);
+      cloud = Sample();
+    } else {
+      ++stats_.skipped["bakes_without_light"];
+      topology = nullptr;
+    }
+    FP_RETURN_IF_ERROR(CheckNotStopped());
+
+    if (topology == nullptr) {
+      auto built = std::make_shared<BakedTopology>();
+      {
+        StageTimer timer(stats_, Stage::kShade);
+        built->open_sides = FindOpenSides(cloud, *accel, settings_.seed, executor_, stats_);
+      }
+      FP_RETURN_IF_ERROR(CheckNotStopped());
+      StageTimer timer(stats_, Stage::kTree);
+      built->topology = PointTree::BuildTopology(cloud, built->open_sides, executor_);
+      topology = std::move(built);
+      // A tree without surfels is that of a scene without light, not that of its geometry.
+      if (cache_ != nullptr && lit) cache_->Put(topology_key_, topology, topology->size_bytes());
+    } else {
+      ++stats_.skipped["bake_stages"];
+    }
+    FP_RETURN_IF_ERROR(CheckNotStopped());
+
+    SurfelShading shading;
+    {
+      StageTimer timer(stats_, Stage::kShade);
+      ShadeOptions options;
+      options.light_samples = settings_.light_samples;
+      options.seed = settings_.seed;
+      options.no_skip = settings_.no_skip;
+      shading =
+          ShadeSurfels(cloud, topology->open_sides, *accel, *lights, options, executor_, stats_);
+    }
+    FP_RETURN_IF_ERROR(CheckNotStopped());
+    StageTimer timer(stats_, Stage::kTree);
+    auto built = std::make_shared<BakedRadiance>();
+    built->surfels = cloud.size();
+    built->blob = PointTree::BuildRadiance(topology->topology, cloud, topology->open_sides, shading,
+                                           executor_);
+    radiance = std::move(built);
+    if (cache_ != nullptr && lit) cache_->Put(radiance_key_, radiance, radiance->blob.size());
+    return absl::OkStatus();
+  }
+
+  SurfelCloud Sample() {
+    if (samplers_.empty()) return {};
+    std::vector<std::shared_ptr<const ObjectSurfels>> surfels(samplers_.size());
+    std::vector<uint8_t> kept(samplers_.size(), 0);
+    executor_.ForEach(samplers_.size(), 1, [&](size_t i) {
+      const Digest& key = samplers_[i]->key();
+      if (cache_ != nullptr) surfels[i] = cache_->Find<ObjectSurfels>(key);
+      kept[i] = surfels[i] != nullptr;
+      if (surfels[i] == nullptr) {
+        surfels[i] = std::make_shared<const ObjectSurfels>(samplers_[i]->Sample());
+        if (cache_ != nullptr) cache_->Put(key, surfels[i], surfels[i]->size_bytes());
+      }
+      samplers_[i].reset();
+    });
+    uint64_t objects = 0, kept_surfels = 0;
+    for (size_t i = 0; i < kept.size(); ++i) {
+      objects += kept[i];
+      if (kept[i] != 0) kept_surfels += surfels[i]->size();
+    }
+    if (objects > 0) {
+      stats_.skipped["objects_kept"] += objects;
+      stats_.skipped["surfels_kept"] += kept_surfels;
+      if (objects == kept.size()) ++stats_.skipped["bake_stages"];
+    }
+    return PlaceSurfels(*prepared_, shapes_, surfels, executor_);
+  }
+
+  const Scene& scene_;
+  const std::shared_ptr<const PreparedScene> prepared_;
+  const RenderSettings& settings_;
+  const BakeOptions& options_;
+  BakeCache* const cache_;
+  Executor& executor_;
+  Stats& stats_;
+
+  std::vector<ObjectShape> shapes_;
+  float spacing_m_ = 0;
+  std::vector<std::unique_ptr<ObjectSampler>> samplers_;  // by object; none if nothing to sample
+  Digest topology_key_, radiance_key_;
+};
+
 }  // namespace
 
 absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settings,
-                                Executor& executor, Stats& stats) {
+                                Executor& executor, Stats& stats, const BakeOptions& options) {
   FP_RETURN_IF_ERROR(ValidateSettings(settings));
   BakedScene baked;
   std::shared_ptr<const PreparedScene> prepared;
-  std::shared_ptr<const RayAccel> accel;
   {
     StageTimer timer(stats, Stage::kImport);
     FP_ASSIGN_OR_RETURN(prepared, PreparedScene::Prepare(scene, executor));
@@ -52,41 +288,16 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
   stats.counts["triangles"] = prepared->triangles().size();
   stats.bytes["scene"] = baked.prepared_scene.size();
   if (settings.integrator == Integrator::kPt) return baked;
-
-  {
-    StageTimer timer(stats, Stage::kImport);
-    FP_ASSIGN_OR_RETURN(accel, RayAccel::Build(prepared));
-  }
-  const LightSampler lights(accel);
-  SurfelCloud cloud;
-  if (lights.any_light() || settings.no_skip) {
-    StageTimer timer(stats, Stage::kSample);
-    const uint64_t count = settings.points != 0 ? settings.points : DefaultSurfelCount(*prepared);
-    cloud = SampleSurfels(*prepared, count, settings.seed, executor);
-  } else {
-    ++stats.skipped["bakes_without_light"];
-  }
-  SurfelShading shading;
-  {
-    StageTimer timer(stats, Stage::kShade);
-    ShadeOptions options;
-    options.light_samples = settings.light_samples;
-    options.seed = settings.seed;
-    options.no_skip = settings.no_skip;
-    shading = ShadeSurfels(cloud, *accel, lights, options, executor, stats);
-  }
-  {
-    StageTimer timer(stats, Stage::kTree);
-    PointTree::Blobs blobs = PointTree::Build(cloud, shading, executor);
-    baked.tree_topology = std::move(blobs.topology);
-    baked.tree_radiance = std::move(blobs.radiance);
-  }
-  stats.counts["surfels"] = cloud.size();
-  stats.bytes["tree"] = baked.tree_topology.size() + baked.tree_radiance.size();
-  FP_ASSIGN_OR_RETURN(const auto tree,
-                      PointTree::FromBlobs(baked.tree_topology, baked.tree_radiance));
-  stats.counts["nodes"] = tree->node_count();
+  FP_RETURN_IF_ERROR(
+      TreeBake(scene, std::move(prepared), settings, options, executor, stats).Run(baked));
   return baked;
+}
+
+absl::StatusOr<float> SurfelSpacing(const Scene& scene, const RenderSettings& settings,
+                                    Executor& executor) {
+  FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(scene, executor));
+  return SpacingFor(settings, TotalAreaM2(MakeObjectShapes(scene, *prepared, executor)),
+                    prepared->diagonal_m());
 }
 
 }  // namespace farpoint

@@ -60,6 +60,33 @@ TEST(BenchCommandLine, MicroTakesAll) {
   EXPECT_EQ(line->output_dir, "d");
 }
 
+TEST(BenchCommandLine, RebakeTakesAll) {
+  const auto line =
+      ParseBenchCommandLine({"rebake",   "--scene", "city",      "--sun",    "0.5,1,-2:3,4,5.5",
+                             "--sky",    "1,2,3",   "--points",  "77",       "--light-samples",
+                             "9",        "--seed",  "3",         "--object", "4",
+                             "--repeat", "2",       "--threads", "1",        "--cache-mib",
+                             "5",        "-o",      "d"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  EXPECT_EQ(line->verb, BenchVerb::kRebake);
+  const RebakeOptions& r = line->rebake;
+  EXPECT_EQ(r.scene, "city");
+  EXPECT_EQ(r.to_sun, Vec3d(0.5, 1, -2));
+  EXPECT_EQ(r.sun, Rgb(3, 4, 5.5f));
+  EXPECT_EQ(r.sky, Rgb(1, 2, 3));
+  EXPECT_EQ(r.points, 77u);
+  EXPECT_EQ(r.light_samples, 9u);
+  EXPECT_EQ(r.seed, 3u);
+  EXPECT_EQ(r.object, 4u);
+  EXPECT_EQ(r.repeat, 2u);
+  EXPECT_EQ(r.threads, 1u);
+  EXPECT_EQ(r.cache_bytes, uint64_t{5} << 20);
+  for (const char* sun : {"1,2,3", "1,2:3,4,5", "0,0,0:1,1,1", "1,2,3:1,1,x", "1,2,3:1,1,nan"}) {
+    EXPECT_THAT(MessageOf({"rebake", "--sun", sun}), HasSubstr("--sun")) << sun;
+  }
+  EXPECT_THAT(MessageOf({"rebake", "--sky", "1,2"}), HasSubstr("--sky"));
+}
+
 TEST(BenchCommandLine, PlannedBenchmarksAreRefusedPlainly) {
   for (const char* name : {"paper", "scale", "stability", "skip", "service"}) {
     const auto line = ParseBenchCommandLine({name, "--quick"});
@@ -73,6 +100,7 @@ TEST(BenchCommandLine, HelpListsWhatWorksOnly) {
   ASSERT_TRUE(line.ok() && line->print.has_value());
   EXPECT_THAT(*line->print, HasSubstr("  pareto "));
   EXPECT_THAT(*line->print, HasSubstr("  micro "));
+  EXPECT_THAT(*line->print, HasSubstr("  rebake "));
   for (const char* name : {"  paper", "  scale", "  stability", "  skip", "  service"}) {
     EXPECT_THAT(*line->print, Not(HasSubstr(name)));
   }

@@ -40,6 +40,7 @@ const std::map<std::string, std::vector<std::string>> kBenchmarks = {
     {"point_tree/build", {"surfels_per_s", "bytes_per_surfel"}},
     {"point_tree/view", {"surfels_per_s", "bytes_per_s"}},
     {"surfel_sampler/sample", {"surfels_per_s"}},
+    {"surfel_shader/open_sides", {"surfels_per_s", "rays_per_s"}},
     {"surfel_shader/shade", {"surfels_per_s", "rays_per_s", "rays_per_surfel"}},
     {"ray_accel/intersect/coherent", {"rays_per_s", "hit_fraction"}},
     {"ray_accel/intersect/incoherent", {"rays_per_s", "hit_fraction"}},

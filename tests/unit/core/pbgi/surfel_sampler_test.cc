@@ -3,16 +3,24 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <cmath>
 
+#include "core/math/elementary.h"
+#include "core/math/sampling.h"
 #include "core/scene/procedural.h"
 #include "tests/unit/core/scene/scene_test_util.h"
 
 namespace farpoint {
 namespace {
 
-std::shared_ptr<const PreparedScene> Cornell() {
+std::shared_ptr<const PreparedScene> Prepare(const Scene& scene) {
   Executor executor(1);
-  return PreparedScene::Prepare(MakeCornellBox(), executor).value();
+  return PreparedScene::Prepare(scene, executor).value();
+}
+
+SurfelCloud Sample(const Scene& scene, uint64_t count, uint64_t seed = 0, unsigned threads = 2) {
+  Executor executor(threads);
+  return SampleSurfels(scene, *Prepare(scene), count, seed, executor);
 }
 
 double SceneArea(const PreparedScene& scene) {
@@ -21,39 +29,85 @@ double SceneArea(const PreparedScene& scene) {
   return area;
 }
 
+Affine RotationAboutY(double angle) {
+  const SinCos sc = DetSinCos(angle);
+  Affine m;
+  m.column[0] = {sc.cos, 0, -sc.sin};
+  m.column[2] = {sc.sin, 0, sc.cos};
+  return m;
+}
+
+// A square metre in the plane z = 0, of `n` by `n` quads cut in two, and its vertices jittered
+// along the surface, so that triangles differ in size and shape.
+Mesh JitteredSquare(int n, double jitter) {
+  Mesh mesh;
+  mesh.name = "square";
+  for (int j = 0; j <= n; ++j) {
+    for (int i = 0; i <= n; ++i) {
+      const auto u = [&](uint64_t k) {
+        const bool border = i == 0 || j == 0 || i == n || j == n;
+        const uint64_t key = HashKey(static_cast<uint64_t>(i), static_cast<uint64_t>(j), k);
+        return border ? 0.0 : jitter * (ToUnitFloat(static_cast<uint32_t>(key)) - 0.5) / n;
+      };
+      mesh.positions.push_back({static_cast<float>(static_cast<double>(i) / n + u(0)),
+                                static_cast<float>(static_cast<double>(j) / n + u(1)), 0});
+    }
+  }
+  const auto at = [n](int i, int j) { return static_cast<uint32_t>(j * (n + 1) + i); };
+  for (int j = 0; j < n; ++j) {
+    for (int i = 0; i < n; ++i) {
+      mesh.triangles.push_back({at(i, j), at(i + 1, j), at(i + 1, j + 1)});
+      mesh.triangles.push_back({at(i, j), at(i + 1, j + 1), at(i, j + 1)});
+    }
+  }
+  return mesh;
+}
+
+Scene SceneOf(Mesh mesh) {
+  Scene scene;
+  scene.meshes.push_back(std::move(mesh));
+  scene.instances.emplace_back();
+  return scene;
+}
+
 TEST(SurfelSampler, GivesAboutTheCountAndTheWholeArea) {
-  const auto scene = Cornell();
-  Executor executor(2);
+  const Scene scene = MakeCornellBox();
+  const double area_m2 = SceneArea(*Prepare(scene));
   for (const uint64_t n : {2000u, 20000u, 88880u}) {
-    const SurfelCloud cloud = SampleSurfels(*scene, n, 0, executor);
+    const SurfelCloud cloud = Sample(scene, n);
     EXPECT_NEAR(static_cast<double>(cloud.size()), static_cast<double>(n),
                 0.08 * static_cast<double>(n));
     double area = 0;
     for (const float a : cloud.area_m2) area += a;
-    EXPECT_NEAR(area, SceneArea(*scene), 1e-4 * SceneArea(*scene));
+    EXPECT_NEAR(area, area_m2, 1e-4 * area_m2);
   }
 }
 
-TEST(SurfelSampler, IsBlueNoise) {
-  const auto scene = Cornell();
-  Executor executor(2);
-  const SurfelCloud cloud = SampleSurfels(*scene, 5000, 0, executor);
-  const double spacing = std::sqrt(SceneArea(*scene) / 5000);
-  // No two surfels of one surface are closer than about 0.78 of the mean spacing.
-  double closest = 1e30;
+struct BlueNoise {
+  size_t count = 0;
+  double closest = 1e30;   // pair, in mean spacings
+  double widest_gap = 0;   // from a point of the square to its nearest surfel, in mean spacings
+  double area_spread = 0;  // standard deviation over mean
+};
+
+BlueNoise MeasureSquare(const SurfelCloud& cloud, const Vec3f& corner) {
+  BlueNoise b;
+  b.count = cloud.size();
+  const double spacing = 1.0 / std::sqrt(static_cast<double>(cloud.size()));
   for (size_t i = 0; i < cloud.size(); ++i) {
     for (size_t j = i + 1; j < cloud.size(); ++j) {
-      if (Dot(cloud.normal[i], cloud.normal[j]) < 0.99f) continue;
-      if (scene->triangles()[cloud.triangle[i]].object !=
-          scene->triangles()[cloud.triangle[j]].object) {
-        continue;
-      }
-      closest =
-          std::min(closest, static_cast<double>(Length(cloud.position[i] - cloud.position[j])));
+      b.closest = std::min(b.closest, Length(Vec3d(cloud.position[i]) - Vec3d(cloud.position[j])));
     }
   }
-  EXPECT_GT(closest, 0.7 * spacing);
-  // And areas follow the local density: they vary little.
+  constexpr int kProbes = 200;
+  for (int y = 0; y < kProbes; ++y) {
+    for (int x = 0; x < kProbes; ++x) {
+      const Vec3d p = Vec3d(corner) + Vec3d((x + 0.5) / kProbes, (y + 0.5) / kProbes, 0);
+      double nearest = 1e30;
+      for (const Vec3f& q : cloud.position) nearest = std::min(nearest, Length(Vec3d(q) - p));
+      b.widest_gap = std::max(b.widest_gap, nearest);
+    }
+  }
   double mean = 0, square = 0;
   for (const float a : cloud.area_m2) {
     mean += a;
@@ -61,38 +115,146 @@ TEST(SurfelSampler, IsBlueNoise) {
   }
   mean /= static_cast<double>(cloud.size());
   square /= static_cast<double>(cloud.size());
-  EXPECT_LT(std::sqrt(square - mean * mean), 0.3 * mean);
+  b.area_spread = std::sqrt(square - mean * mean) / mean;
+  b.closest /= spacing;
+  b.widest_gap /= spacing;
+  return b;
 }
+
+class SurfelSamplerMesh : public testing::TestWithParam<int> {};
+
+// From one large quad to triangles smaller than a surfel, with 1,500 surfels in all of them.
+TEST_P(SurfelSamplerMesh, IsBlueNoise) {
+  const Scene scene = SceneOf(JitteredSquare(GetParam(), 0.4));
+  const auto prepared = Prepare(scene);
+  const BlueNoise b = MeasureSquare(Sample(scene, 1500), prepared->bounds().min);
+  RecordProperty("closest", std::to_string(b.closest));
+  RecordProperty("widest_gap", std::to_string(b.widest_gap));
+  RecordProperty("area_spread", std::to_string(b.area_spread));
+  EXPECT_NEAR(static_cast<double>(b.count), 1500, 0.06 * 1500);
+  EXPECT_GT(b.closest, 0.70);
+  // A maximal set would leave no point farther away than the least distance; eight candidates to a
+  // surfel leave some, in corners most of all.
+  EXPECT_LT(b.widest_gap, 1.2);
+  EXPECT_LT(b.area_spread, 0.3);
+}
+
+INSTANTIATE_TEST_SUITE_P(Quads, SurfelSamplerMesh, testing::Values(1, 3, 12, 40, 150));
 
 TEST(SurfelSampler, IsTheSameForAnyNumberOfThreads) {
-  const auto scene = Cornell();
-  Executor one(1), four(4);
-  const SurfelCloud a = SampleSurfels(*scene, 10000, 3, one);
-  const SurfelCloud b = SampleSurfels(*scene, 10000, 3, four);
-  EXPECT_EQ(a.position, b.position);
-  EXPECT_EQ(a.area_m2, b.area_m2);
-  EXPECT_NE(a.position, SampleSurfels(*scene, 10000, 4, one).position);
+  // 40,000 surfels: several cubes and pieces for each thread.
+  const Scene scene = SceneOf(JitteredSquare(60, 0.5));
+  const SurfelCloud a = Sample(scene, 40000, 3, 1);
+  for (const unsigned threads : {2u, 5u}) {
+    const SurfelCloud b = Sample(scene, 40000, 3, threads);
+    EXPECT_EQ(a.position, b.position);
+    EXPECT_EQ(a.area_m2, b.area_m2);
+    EXPECT_EQ(a.barycentric, b.barycentric);
+  }
+  EXPECT_NE(a.position, Sample(scene, 40000, 4, 1).position);
 }
 
-TEST(SurfelSampler, AnObjectKeepsItsSurfelsWhenItsPeersChange) {
+TEST(SurfelSampler, AnObjectThatIsMovedOrTurnedKeepsItsSurfels) {
+  // Moves that change the scene's bounds, and with them the origin and the rounding of every
+  // vertex; rotations; and all of that for a scaled and a mirrored instance.
+  for (const double scale : {1.0, 0.3, -1.7}) {
+    Scene scene = MakeCornellBox();
+    const size_t last = scene.instances.size() - 1;
+    for (Vec3d& column : scene.instances[last].world_from_mesh.column) column *= scale;
+    const Affine rest = scene.instances[last].world_from_mesh;
+    const SurfelCloud before = Sample(scene, 8000);
+    uint64_t moved = 0;
+    for (const double angle : {0.0, 0.3, 1.0, 2.5, 4.4}) {
+      for (const double shift : {0.1, 7.7, 12345.678}) {
+        Affine m = RotationAboutY(angle) * rest;
+        m.translation = rest.translation + Vec3d(shift, shift / 3, -shift * 0.7);
+        scene.instances[last].world_from_mesh = m;
+        const SurfelCloud after = Sample(scene, 8000);
+        EXPECT_EQ(before.triangle, after.triangle) << scale << " " << angle << " " << shift;
+        EXPECT_EQ(before.barycentric, after.barycentric);
+        EXPECT_EQ(before.area_m2, after.area_m2);
+        moved += before.position != after.position;
+      }
+    }
+    EXPECT_EQ(moved, 15u);
+  }
+}
+
+TEST(SurfelSampler, AStretchedObjectKeepsItsSurfelsWhenMoved) {
+  Scene scene = SceneOf(JitteredSquare(4, 0.5));
+  scene.instances[0].world_from_mesh.column[0] *= 100;  // beyond what is free of its rotation
+  const SurfelCloud before = Sample(scene, 3000);
+  double area = 0;
+  for (const float a : before.area_m2) area += a;
+  EXPECT_NEAR(area, 100, 1e-3);
+  EXPECT_NEAR(static_cast<double>(before.size()), 3000, 240);
+  scene.instances[0].world_from_mesh.translation = {1.1, 2.2, 3.3};
+  const SurfelCloud after = Sample(scene, 3000);
+  EXPECT_EQ(before.barycentric, after.barycentric);
+  EXPECT_EQ(before.area_m2, after.area_m2);
+}
+
+TEST(SurfelSampler, ScalingByAPowerOfTwoScalesTheSurfels) {
   Scene scene = MakeCornellBox();
+  const SurfelCloud before = Sample(scene, 5000);
+  for (Instance& instance : scene.instances) {
+    for (Vec3d& column : instance.world_from_mesh.column) column *= 0.125;
+    instance.world_from_mesh.translation *= 0.125;
+  }
+  const SurfelCloud after = Sample(scene, 5000);
+  EXPECT_EQ(before.triangle, after.triangle);
+  EXPECT_EQ(before.barycentric, after.barycentric);
+  ASSERT_EQ(before.size(), after.size());
+  for (size_t i = 0; i < before.size(); ++i) {
+    EXPECT_EQ(before.position[i] * 0.125f, after.position[i]);
+    EXPECT_EQ(before.area_m2[i] / 64, after.area_m2[i]);
+  }
+}
+
+TEST(SurfelSampler, KeysNameWhatDecides) {
+  const Scene scene = MakeCornellBox();
+  const auto prepared = Prepare(scene);
   Executor executor(1);
-  const auto before = PreparedScene::Prepare(scene, executor).value();
-  const SurfelCloud a = SampleSurfels(*before, 8000, 0, executor);
-  // The last object moves by a tenth of a metre; the rest must not notice.
-  scene.instances.back().world_from_mesh.translation += Vec3d(0.1, 0, 0.1);
-  const auto after = PreparedScene::Prepare(scene, executor).value();
-  ASSERT_EQ(before->origin(), after->origin());  // the bounding box is the walls'
-  const SurfelCloud b = SampleSurfels(*after, 8000, 0, executor);
-  const uint32_t last = static_cast<uint32_t>(before->objects().size() - 1);
-  std::vector<Vec3f> pa, pb;
-  for (size_t i = 0; i < a.size(); ++i) {
-    if (before->triangles()[a.triangle[i]].object != last) pa.push_back(a.position[i]);
+  const auto shapes = MakeObjectShapes(scene, *prepared, executor);
+  const auto key = [&](size_t object, float spacing, uint64_t seed) {
+    return ObjectSampler(shapes[object], *prepared, object, spacing, seed, executor).key();
+  };
+  EXPECT_EQ(key(0, 0.01f, 0), key(0, 0.01f, 0));
+  EXPECT_NE(key(0, 0.01f, 0), key(0, 0.0101f, 0));
+  EXPECT_NE(key(0, 0.01f, 0), key(0, 0.01f, 1));
+  EXPECT_NE(key(0, 0.01f, 0), key(shapes.size() - 1, 0.01f, 0));
+}
+
+TEST(SurfelSampler, ThinSheetsKeepBothOfTheirSides) {
+  // Two squares a hundredth of a spacing apart that face away from each other: each has its own.
+  Mesh mesh = JitteredSquare(1, 0);
+  const auto n = static_cast<uint32_t>(mesh.positions.size());
+  for (uint32_t i = 0; i < n; ++i) mesh.positions.push_back(mesh.positions[i] - Vec3f(0, 0, 3e-4f));
+  const size_t triangles = mesh.triangles.size();
+  for (size_t t = 0; t < triangles; ++t) {
+    const auto& v = mesh.triangles[t];
+    mesh.triangles.push_back({v[0] + n, v[2] + n, v[1] + n});
   }
-  for (size_t i = 0; i < b.size(); ++i) {
-    if (after->triangles()[b.triangle[i]].object != last) pb.push_back(b.position[i]);
-  }
-  EXPECT_EQ(pa, pb);
+  const SurfelCloud cloud = Sample(SceneOf(std::move(mesh)), 2000);
+  size_t up = 0;
+  for (const Vec3f& normal : cloud.normal) up += normal.z > 0;
+  EXPECT_NEAR(static_cast<double>(up), 1000, 60);
+  EXPECT_NEAR(static_cast<double>(cloud.size() - up), 1000, 60);
+}
+
+TEST(SurfelSampler, LongSliversHaveTheirArea) {
+  // 1,000 m by 1 mm beside a square metre.
+  Scene scene = SceneOf(JitteredSquare(1, 0));
+  Mesh sliver;
+  sliver.positions = {{0, 0, 1}, {577.0f, 577.0f, 578.0f}, {0, 0.001f, 1}};
+  sliver.triangles = {{0, 1, 2}};
+  scene.meshes.push_back(sliver);
+  scene.instances.emplace_back();
+  scene.instances.back().mesh = 1;
+  const SurfelCloud cloud = Sample(scene, 2000);
+  double area = 0;
+  for (const float a : cloud.area_m2) area += a;
+  EXPECT_NEAR(area, 1 + 0.5 * 0.001 * 577 * std::sqrt(2.0), 1e-5);
 }
 
 TEST(SurfelSampler, HolesOfAlphaMasksAreNoSurface) {
@@ -118,7 +280,13 @@ TEST(SurfelSampler, HolesOfAlphaMasksAreNoSurface) {
   const auto prepared = PreparedScene::Prepare(scene, executor);
   ASSERT_TRUE(prepared.ok()) << prepared.status();
   ASSERT_TRUE((*prepared)->has_alpha_masks());
-  const SurfelCloud cloud = SampleSurfels(**prepared, 2000, 0, executor);
+  const auto key = [&](const Scene& s) {
+    const auto p = PreparedScene::Prepare(s, executor).value();
+    const auto shapes = MakeObjectShapes(s, *p, executor);
+    return ObjectSampler(shapes[0], *p, 0, 0.02f, 0, executor).key();
+  };
+  const Digest before = key(scene);
+  const SurfelCloud cloud = SampleSurfels(scene, **prepared, 2000, 0, executor);
   ASSERT_GT(cloud.size(), 500u);
   double area = 0;
   for (size_t i = 0; i < cloud.size(); ++i) {
@@ -126,16 +294,34 @@ TEST(SurfelSampler, HolesOfAlphaMasksAreNoSurface) {
     area += cloud.area_m2[i];
   }
   EXPECT_NEAR(area, 0.5, 0.005);
+  // Another picture with the same holes leaves the key, other holes do not.
+  scene.textures[0].encoded = Blob::FromString(MakePng(2, 1, {9, 9, 9, 0, 99, 99, 99, 255}));
+  EXPECT_EQ(key(scene), before);
+  scene.textures[0].encoded = Blob::FromString(MakePng(2, 1, {9, 9, 9, 255, 99, 99, 99, 0}));
+  EXPECT_NE(key(scene), before);
 }
 
 TEST(SurfelSampler, SmallObjectsGetAtLeastOne) {
-  const auto scene = Cornell();
-  Executor executor(1);
-  const SurfelCloud cloud = SampleSurfels(*scene, 1, 0, executor);
-  std::vector<bool> seen(scene->objects().size());
-  for (const uint32_t t : cloud.triangle) seen[scene->triangles()[t].object] = true;
+  const Scene scene = MakeCornellBox();
+  const auto prepared = Prepare(scene);
+  const SurfelCloud cloud = Sample(scene, 1);
+  std::vector<bool> seen(prepared->objects().size());
+  for (const uint32_t t : cloud.triangle) seen[prepared->triangles()[t].object] = true;
   for (const bool s : seen) EXPECT_TRUE(s);
-  EXPECT_EQ(SampleSurfels(*scene, 0, 0, executor).size(), 0u);
+  EXPECT_EQ(Sample(scene, 0).size(), 0u);
+}
+
+TEST(SurfelSpacing, ChangesInSteps) {
+  EXPECT_EQ(SurfelSpacingM(0, 100), 0);
+  EXPECT_EQ(SurfelSpacingM(1, 0), 0);
+  // About sqrt(area / count), in steps of less than 0.8 %.
+  EXPECT_NEAR(SurfelSpacingM(4, 10000), 0.759 * 0.02, 0.004 * 0.02);
+  EXPECT_EQ(SurfelSpacingM(4, 10000), SurfelSpacingM(std::nextafter(4.0, 5.0), 10000));
+  EXPECT_EQ(SurfelSpacingM(16, 10000), 2 * SurfelSpacingM(4, 10000));
+  // 500 squares along the diagonal, within the limits.
+  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1), 0.759 / 500, 0.07 * 0.759 / 500);
+  EXPECT_NEAR(DefaultSurfelSpacingM(0.001, 1), 0.759 * std::sqrt(0.001 / 1e5), 2e-5 * 0.8);
+  EXPECT_EQ(DefaultSurfelSpacingM(0, 0), 0);
 }
 
 }  // namespace

@@ -12,6 +12,7 @@ namespace {
 struct Shaded {
   std::shared_ptr<const PreparedScene> scene;
   SurfelCloud cloud;
+  SurfelSides open_sides;
   SurfelShading shading;
   Stats stats;
 };
@@ -22,8 +23,10 @@ Shaded Shade(const Scene& description, uint64_t n, unsigned threads = 1) {
   s.scene = PreparedScene::Prepare(description, executor).value();
   const auto accel = RayAccel::Build(s.scene).value();
   const LightSampler lights(accel);
-  s.cloud = SampleSurfels(*s.scene, n, 0, executor);
-  s.shading = ShadeSurfels(s.cloud, *accel, lights, ShadeOptions(), executor, s.stats);
+  s.cloud = SampleSurfels(description, *s.scene, n, 0, executor);
+  s.open_sides = FindOpenSides(s.cloud, *accel, 0, executor, s.stats);
+  s.shading =
+      ShadeSurfels(s.cloud, s.open_sides, *accel, lights, ShadeOptions(), executor, s.stats);
   return s;
 }
 

@@ -1,0 +1,45 @@
+// One object in a frame of its own: what decides where its surfels lie, and nothing else.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <vector>
+
+#include "core/base/hash.h"
+#include "core/scene/prepared_scene.h"
+#include "core/scene/scene.h"
+
+namespace farpoint {
+
+// The kept triangles of one object, made from the mesh and the linear part of the instance's
+// transform, without its translation and (but for stretched instances, below) its rotation, and
+// scaled by a power of two. So an object that is moved, or turned, has the same shape bit by bit,
+// wherever the scene's origin lies.
+//
+// The frame is that of the symmetric factor of the polar decomposition of the linear part, rounded
+// to 20 bits, so that the rounding errors of a rotation vanish: lengths agree with the world's
+// within 2^-16. An instance that is stretched by more than 16 : 1 keeps its linear part as it is:
+// then a rotation gives another shape.
+struct ObjectShape {
+  std::vector<Vec3f> vertices;                     // in units; 0 where no kept triangle uses it
+  std::vector<std::array<uint32_t, 3>> triangles;  // in the prepared scene's order and winding
+  std::vector<float> areas;                        // of the triangles, units²
+  double unit_m = 1;                               // metres per unit: a power of two
+  double area = 0;                                 // units²; the sum of `areas`
+  Digest digest;                                   // of vertices and triangles
+
+  double area_m2() const { return area * unit_m * unit_m; }
+};
+
+// The shape of object `object` of `prepared`, which Prepare made from `scene` (not FromBlob).
+ObjectShape MakeObjectShape(const Scene& scene, const PreparedScene& prepared, size_t object,
+                            uint32_t first_vertex);
+
+// The shapes of all objects, in parallel.
+std::vector<ObjectShape> MakeObjectShapes(const Scene& scene, const PreparedScene& prepared,
+                                          Executor& executor);
+
+// Σ area_m2 in the order of the objects.
+double TotalAreaM2(const std::vector<ObjectShape>& shapes);
+
+}  // namespace farpoint
