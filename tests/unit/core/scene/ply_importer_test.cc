@@ -214,7 +214,8 @@ TEST(PlyImporter, SurvivesEveryTruncationAndDamage) {
     const auto imported = Import(ply);
     if (!imported.ok()) {
       EXPECT_THAT(std::string(imported.status().message()),
-                  ::testing::ContainsRegex("a.ply: (line [0-9]+|header|.+ [0-9]+(, (line|byte) [0-9]+)?): "));
+                  ::testing::ContainsRegex(
+                      "a.ply: (line [0-9]+|header|.+ [0-9]+(, (line|byte) [0-9]+)?): "));
       return;
     }
     const auto prepared = PreparedScene::Prepare(imported->scene, executor);
