@@ -5,22 +5,15 @@
 #include <unistd.h>
 
 #include <cerrno>
-#include <cstring>
 #include <filesystem>
+
+#include "core/base/posix_file.h"
 
 namespace farpoint {
 
 namespace fs = std::filesystem;
 
 namespace {
-
-absl::Status DiskError(const std::string& what, const std::string& path, int error) {
-  const std::string text = what + " '" + path + "': " + std::strerror(error);
-  if (error == ENOSPC || error == EDQUOT) {
-    return absl::ResourceExhaustedError(text + "; free some space and try again");
-  }
-  return absl::UnavailableError(text);
-}
 
 absl::Status WrongHash(const Digest& digest, const Digest& found) {
   return absl::DataLossError("blob " + digest.Hex() + " arrived with the contents of " +
@@ -31,12 +24,15 @@ absl::Status WrongHash(const Digest& digest, const Digest& found) {
 
 class FileBlobWriter final : public BlobWriter {
  public:
-  FileBlobWriter(BlobStore& store, const Digest& digest, uint64_t size, std::string part, int fd)
-      : store_(store), digest_(digest), size_(size), part_(std::move(part)), fd_(fd) {}
+  FileBlobWriter(BlobStore& store, const Digest& digest, uint64_t size, std::string part,
+                 Descriptor file)
+      : store_(store),
+        digest_(digest),
+        size_(size),
+        part_(std::move(part)),
+        file_(std::move(file)) {}
   ~FileBlobWriter() override {
-    if (fd_ < 0) return;
-    ::close(fd_);
-    ::unlink(part_.c_str());
+    if (file_.valid()) ::unlink(part_.c_str());
   }
 
   absl::Status Append(std::span<const std::byte> data) override {
@@ -45,13 +41,7 @@ class FileBlobWriter final : public BlobWriter {
                                         std::to_string(size_) + " bytes, more arrive");
     }
     hash_.Update(data);
-    size_t done = 0;
-    while (done < data.size()) {
-      const ssize_t n = ::write(fd_, data.data() + done, data.size() - done);
-      if (n < 0 && errno == EINTR) continue;
-      if (n <= 0) return DiskError("cannot write", part_, n == 0 ? ENOSPC : errno);
-      done += static_cast<size_t>(n);
-    }
+    FP_RETURN_IF_ERROR(WriteAll(file_.get(), data, part_));
     written_ += data.size();
     return absl::OkStatus();
   }
@@ -64,18 +54,13 @@ class FileBlobWriter final : public BlobWriter {
     }
     const Digest found = hash_.Finish();
     if (found != digest_) return WrongHash(digest_, found);
-    if (::fsync(fd_) != 0) return DiskError("cannot flush", part_, errno);
+    if (::fsync(file_.get()) != 0) return DiskError("cannot flush", part_, errno);
     const std::string path = store_.PathOf(digest_);
     if (::rename(part_.c_str(), path.c_str()) != 0) {
       return DiskError("cannot rename to", path, errno);
     }
-    ::close(fd_);
-    fd_ = -1;
-    if (const int folder = ::open(store_.directory_.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-        folder >= 0) {
-      ::fsync(folder);
-      ::close(folder);
-    }
+    file_.Reset();
+    SyncFolder(store_.directory_);
     std::lock_guard lock(store_.mutex_);
     store_.verified_.insert(digest_);
     return absl::OkStatus();
@@ -86,7 +71,7 @@ class FileBlobWriter final : public BlobWriter {
   const Digest digest_;
   const uint64_t size_;
   const std::string part_;
-  int fd_;
+  Descriptor file_;
   uint64_t written_ = 0;
   Sha256 hash_;
 };
@@ -207,9 +192,10 @@ absl::StatusOr<std::unique_ptr<BlobWriter>> BlobStore::StartPut(const Digest& di
     std::lock_guard lock(mutex_);
     part += "." + std::to_string(next_part_++) + ".part";
   }
-  const int fd = ::open(part.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
-  if (fd < 0) return DiskError("cannot create", part, errno);
-  return std::make_unique<FileBlobWriter>(*this, digest, size_bytes, part, fd);
+  Descriptor file(::open(part.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644));
+  if (!file.valid()) return DiskError("cannot create", part, errno);
+  return std::make_unique<FileBlobWriter>(*this, digest, size_bytes, std::move(part),
+                                          std::move(file));
 }
 
 void BlobStore::Drop(const Digest& digest) {

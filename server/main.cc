@@ -1,16 +1,11 @@
 // farpoint-server: flags, log, signals. Everything else is the coordinator's.
-#include <pthread.h>
-#include <spdlog/sinks/stdout_color_sinks.h>
-#include <spdlog/spdlog.h>
-#include <unistd.h>
-
 #include <CLI/CLI.hpp>
 #include <chrono>
-#include <csignal>
 #include <cstdio>
 #include <string>
 
 #include "core/base/blob.h"
+#include "proto/service_main.h"
 #include "server/coordinator.h"
 #include "server/grpc_server.h"
 #include "server/scene_baker.h"
@@ -18,9 +13,7 @@
 namespace farpoint {
 namespace {
 
-constexpr int kExitUsage = 2;
-constexpr int kExitPermanent = 42;
-constexpr int kExitTryAgain = 75;
+constexpr const char* kProgram = "farpoint-server";
 
 struct ServerFlags {
   std::string listen = "127.0.0.1:7447";
@@ -29,13 +22,9 @@ struct ServerFlags {
   uint64_t silence_ms = 5000, lease_ms = 120000, heartbeat_ms = 1000, speculate_after_ms = 5000;
   uint64_t retention_hours = 24 * 7, drain_seconds = 30;
   uint64_t max_blob_bytes = uint64_t{1} << 36;
+  uint64_t bake_cache_mib = kDefaultBakeCacheBytes >> 20;
   JobLimits limits;
 };
-
-int ExitCodeOf(const absl::Status& status) {
-  return absl::IsUnavailable(status) || absl::IsResourceExhausted(status) ? kExitTryAgain
-                                                                          : kExitPermanent;
-}
 
 void DefineFlags(CLI::App& app, ServerFlags& flags) {
   app.set_version_flag("--version", "farpoint-server " FARPOINT_VERSION);
@@ -47,7 +36,7 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
   app.add_option("--threads", flags.threads, "Threads that bake scenes; 0: all cores");
   app.add_option("--port-file", flags.port_file, "Write the chosen port to this file");
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
-      ->check(CLI::IsMember({"trace", "debug", "info", "warn", "warning", "error", "off"}))
+      ->check(CLI::IsMember(LogLevelNames()))
       ->capture_default_str();
   const auto number = [&app](const char* name, uint64_t& value, uint64_t min, const char* text) {
     app.add_option(name, value, text)
@@ -61,6 +50,10 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
          "A slow tile is copied to an idle worker no sooner");
   number("--drain-seconds", flags.drain_seconds, 0, "How long a stop waits for tiles in work");
   number("--retention-hours", flags.retention_hours, 1, "How long ended jobs are kept");
+  app.add_option("--bake-cache-mib", flags.bake_cache_mib,
+                 "MiB of memory for what bakes leave to later ones of nearly the same scene")
+      ->check(CLI::Range(uint64_t{0}, uint64_t{1} << 24))
+      ->capture_default_str();
   number("--max-blob-bytes", flags.max_blob_bytes, 1, "Largest blob that is taken");
   number("--max-pixels", flags.limits.max_pixels, 1, "Most pixels of a job");
   number("--max-asset-bytes", flags.limits.max_asset_bytes, 1, "Most bytes of a job's files");
@@ -70,30 +63,7 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
 }
 
 void LogEntry(const CoordinatorLogEntry& entry) {
-  std::string line;
-  if (!entry.job.empty()) line += "job=" + entry.job.value + " ";
-  if (entry.tile) line += "tile=" + std::to_string(*entry.tile) + " ";
-  if (entry.attempt != 0) line += "attempt=" + std::to_string(entry.attempt) + " ";
-  if (!entry.worker.empty()) line += "worker=" + entry.worker.value + " ";
-  line += entry.text;
-  switch (entry.level) {
-    case CoordinatorLogEntry::Level::kInfo:
-      spdlog::info("{}", line);
-      break;
-    case CoordinatorLogEntry::Level::kWarning:
-      spdlog::warn("{}", line);
-      break;
-    case CoordinatorLogEntry::Level::kError:
-      spdlog::error("{}", line);
-      break;
-  }
-}
-
-// Waits for SIGTERM or SIGINT, at most `timeout`. True: one came.
-bool WaitForSignal(const sigset_t& signals, std::chrono::milliseconds timeout) {
-  const timespec limit{.tv_sec = timeout.count() / 1000,
-                       .tv_nsec = (timeout.count() % 1000) * 1000000};
-  return ::sigtimedwait(&signals, nullptr, &limit) > 0;
+  WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, entry.worker, entry.text));
 }
 
 int Main(int argc, char** argv) {
@@ -103,22 +73,19 @@ int Main(int argc, char** argv) {
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : kExitUsage;
+    return app.exit(error) == 0 ? 0 : kServiceExitUsage;
   }
-  spdlog::set_default_logger(spdlog::stderr_color_mt("farpoint-server"));
-  spdlog::set_level(spdlog::level::from_str(flags.log_level));
-
-  // Before any thread starts, so that all inherit the mask and only this one hears them.
-  sigset_t signals;
-  sigemptyset(&signals);
-  sigaddset(&signals, SIGTERM);
-  sigaddset(&signals, SIGINT);
-  ::pthread_sigmask(SIG_BLOCK, &signals, nullptr);
-  std::signal(SIGPIPE, SIG_IGN);
+  if (const absl::Status bad = CheckHostPort("--listen", flags.listen, /*any_port=*/true);
+      !bad.ok()) {
+    ReportFatal(kProgram, bad);
+    return kServiceExitUsage;
+  }
+  StartLog(kProgram, flags.log_level);
+  const StopSignals signals;
 
   CoordinatorOptions options;
   options.store_directory = flags.store;
-  options.baker = MakeCoreBaker(flags.threads);
+  options.baker = MakeCoreBaker(flags.threads, flags.bake_cache_mib << 20);
   options.limits = flags.limits;
   options.max_blob_bytes = flags.max_blob_bytes;
   options.heartbeat = std::chrono::milliseconds(flags.heartbeat_ms);
@@ -133,48 +100,43 @@ int Main(int argc, char** argv) {
                  "raise it\n",
                  static_cast<unsigned long long>(flags.silence_ms),
                  static_cast<unsigned long long>(flags.heartbeat_ms));
-    return kExitUsage;
+    return kServiceExitUsage;
   }
 
   absl::StatusOr<std::unique_ptr<Coordinator>> coordinator = Coordinator::Open(std::move(options));
   if (!coordinator.ok()) {
-    std::fprintf(stderr, "farpoint-server: %s\n", coordinator.status().ToString().c_str());
-    return ExitCodeOf(coordinator.status());
+    return ReportFatal(kProgram, coordinator.status());
   }
   absl::StatusOr<std::unique_ptr<GrpcServer>> server =
       GrpcServer::Start(**coordinator, flags.listen);
   if (!server.ok()) {
-    std::fprintf(stderr, "farpoint-server: %s\n", server.status().ToString().c_str());
-    return ExitCodeOf(server.status());
+    return ReportFatal(kProgram, server.status());
   }
   const std::string port = std::to_string((*server)->port());
   if (!flags.port_file.empty()) {
     const absl::Status written =
         WriteFileAtomically(flags.port_file, std::as_bytes(std::span(port.data(), port.size())));
-    if (!written.ok()) {
-      std::fprintf(stderr, "farpoint-server: --port-file: %s\n", written.ToString().c_str());
-      return ExitCodeOf(written);
-    }
+    if (!written.ok()) return ReportFatal(kProgram, Annotate(written, "--port-file"));
   }
   const std::string host = flags.listen.substr(0, flags.listen.rfind(':'));
   std::printf("listening on %s:%s\n", host.c_str(), port.c_str());
   std::fflush(stdout);
-  spdlog::info("farpoint-server {} listening on {}:{}, store '{}'", FARPOINT_VERSION, host, port,
-               flags.store);
+  WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " listening on " + host +
+                                ":" + port + ", store '" + flags.store + "'");
 
-  while (!WaitForSignal(signals, std::chrono::hours(1))) {
+  while (!signals.Wait(std::chrono::hours(1))) {
   }
-  spdlog::info("draining: no new leases; a second signal ends at once");
+  WriteLog(LogLevel::kInfo, "draining: no new leases; a second signal ends at once");
   (*server)->StopServing();
   (*coordinator)->Drain();
   const auto end = std::chrono::steady_clock::now() + std::chrono::seconds(flags.drain_seconds);
   while ((*coordinator)->ActiveLeases() > 0 && std::chrono::steady_clock::now() < end) {
-    if (WaitForSignal(signals, std::chrono::milliseconds(50))) break;
+    if (signals.Wait(std::chrono::milliseconds(50))) break;
   }
   (*server)->Shutdown(std::chrono::milliseconds(500));
   server->reset();
   coordinator->reset();
-  spdlog::info("stopped");
+  WriteLog(LogLevel::kInfo, "stopped");
   return 0;
 }
 

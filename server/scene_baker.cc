@@ -16,35 +16,56 @@ absl::Status CheckNotStopped(const std::atomic<bool>& cancel) {
   return absl::OkStatus();
 }
 
+void HashPart(Sha256& hash, std::string_view part) {
+  hash.UpdateU64(part.size());
+  hash.Update(part);
+}
+
+// Adds the time until its end to the stage of importing.
+class ImportTimer {
+ public:
+  explicit ImportTimer(Stats& stats) : stats_(stats) {}
+  ~ImportTimer() {
+    constexpr auto kImport = static_cast<size_t>(Stage::kImport);
+    stats_.seconds[kImport] += ThreadCpuSeconds() - cpu_start_;
+    stats_.wall_seconds[kImport] += std::chrono::duration<double>(clock_.Now() - start_).count();
+  }
+
+ private:
+  Stats& stats_;
+  const SteadyClock clock_;
+  const TimePoint start_ = clock_.Now();
+  const double cpu_start_ = ThreadCpuSeconds();
+};
+
 class CoreBaker final : public SceneBaker {
  public:
-  explicit CoreBaker(unsigned threads) : executor_(threads) {}
+  CoreBaker(unsigned threads, uint64_t cache_bytes) : executor_(threads), cache_(cache_bytes) {}
 
   absl::StatusOr<BakeResult> Bake(const AssetBundle& asset, const JobSpec& spec,
                                   std::optional<double> time_s,
                                   const std::atomic<bool>& cancel) override {
     BakeResult result;
-    ImportOptions options;
-    options.light_units = spec.light_units;
-    options.max_triangles = spec.limits.max_triangles;
-    options.time_s = time_s;
+    FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
+    ImportedScene imported;
+    {
+      ImportTimer timer(result.stats);
+      FP_ASSIGN_OR_RETURN(imported, Import(asset, spec, time_s));
+      result.made_up_camera = imported.scene.cameras.empty();
+      EnsureCameraAndLight(imported);
+    }
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
 
-    const SteadyClock clock;
-    const TimePoint start = clock.Now();
-    const double cpu_start = ThreadCpuSeconds();
-    FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, options));
-    FP_RETURN_IF_ERROR(ApplyOverrides(spec.overrides, asset, imported.scene));
-    result.made_up_camera = imported.scene.cameras.empty();
-    EnsureCameraAndLight(imported);
-    constexpr auto kImport = static_cast<size_t>(Stage::kImport);
-    result.stats.seconds[kImport] += ThreadCpuSeconds() - cpu_start;
-    result.stats.wall_seconds[kImport] +=
-        std::chrono::duration<double>(clock.Now() - start).count();
-    FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
-
-    FP_ASSIGN_OR_RETURN(result.blobs,
-                        farpoint::Bake(imported.scene, spec.settings, executor_, result.stats));
+    BakeOptions options;
+    options.cache = &cache_;
+    options.cancel = &cancel;
+    if (time_s && imported.animation && spec.settings.integrator != Integrator::kPt) {
+      ImportTimer timer(result.stats);
+      FP_ASSIGN_OR_RETURN(options.surfel_spacing_m, SpacingAtRest(asset, spec));
+      FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
+    }
+    FP_ASSIGN_OR_RETURN(result.blobs, farpoint::Bake(imported.scene, spec.settings, executor_,
+                                                     result.stats, options));
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
     result.cameras = std::move(imported.scene.cameras);
     result.notes = std::move(imported.notes);
@@ -53,18 +74,39 @@ class CoreBaker final : public SceneBaker {
   }
 
  private:
-  Executor executor_;
-};
+  static absl::StatusOr<ImportedScene> Import(const AssetBundle& asset, const JobSpec& spec,
+                                              std::optional<double> time_s) {
+    ImportOptions options;
+    options.light_units = spec.light_units;
+    options.max_triangles = spec.limits.max_triangles;
+    options.time_s = time_s;
+    FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, options));
+    FP_RETURN_IF_ERROR(ApplyOverrides(spec.overrides, asset, imported.scene));
+    return imported;
+  }
 
-void HashPart(Sha256& hash, std::string_view part) {
-  hash.UpdateU64(part.size());
-  hash.Update(part);
-}
+  // The spacing of the scene at rest, for all of its frames: it may not depend on a frame, or the
+  // surfels of objects that stand still would change from one to the next.
+  absl::StatusOr<float> SpacingAtRest(const AssetBundle& asset, const JobSpec& spec) {
+    Sha256 hash;
+    HashPart(hash, "spacing at rest");
+    HashPart(hash, BakeKey(spec).Hex());
+    const Digest key = hash.Finish();
+    if (const auto known = cache_.Find<float>(key)) return *known;
+    FP_ASSIGN_OR_RETURN(const ImportedScene rest, Import(asset, spec, std::nullopt));
+    FP_ASSIGN_OR_RETURN(const float spacing_m, SurfelSpacing(rest.scene, spec.settings, executor_));
+    cache_.Put(key, std::make_shared<const float>(spacing_m), sizeof(float));
+    return spacing_m;
+  }
+
+  Executor executor_;
+  BakeCache cache_;
+};
 
 }  // namespace
 
-std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads) {
-  return std::make_shared<CoreBaker>(threads);
+std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads, uint64_t cache_bytes) {
+  return std::make_shared<CoreBaker>(threads, cache_bytes);
 }
 
 Digest BakeKey(const JobSpec& spec) {

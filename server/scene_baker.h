@@ -2,6 +2,7 @@
 #pragma once
 
 #include <atomic>
+#include <cstdint>
 #include <memory>
 #include <optional>
 #include <string>
@@ -37,8 +38,15 @@ class SceneBaker {
                                           const std::atomic<bool>& cancel) = 0;
 };
 
+// What a baker keeps in memory for later bakes, if not told otherwise.
+inline constexpr uint64_t kDefaultBakeCacheBytes = uint64_t{2} << 30;
+
 // Import, overrides, camera and light if there are none, Bake: on `threads` threads (0: all cores).
-std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads);
+// Products of its stages are kept, at most `cache_bytes` of them (0: none), so that a bake of
+// nearly the same scene does again only what the change affects (core/render/bake.h); the result is
+// that of a first bake. Surfels of an animated scene lie as densely at all times as at rest.
+std::shared_ptr<SceneBaker> MakeCoreBaker(unsigned threads,
+                                          uint64_t cache_bytes = kDefaultBakeCacheBytes);
 
 // What decides a bake's blobs and nothing else: the asset's files, overrides, light units, the
 // settings that Bake reads, and this version. Jobs with equal keys share their blobs. Settings that

@@ -8,31 +8,17 @@
 #include <algorithm>
 #include <cerrno>
 #include <chrono>
-#include <cstring>
 #include <filesystem>
 #include <thread>
 #include <vector>
+
+#include "core/base/posix_file.h"
 
 namespace farpoint {
 
 namespace fs = std::filesystem;
 
 namespace {
-
-absl::Status DiskError(const std::string& what, const std::string& path, int error) {
-  const std::string text = what + " '" + path + "': " + std::strerror(error);
-  if (error == ENOSPC || error == EDQUOT) {
-    return absl::ResourceExhaustedError(text + "; free some space or choose another --cache");
-  }
-  return absl::UnavailableError(text);
-}
-
-struct Descriptor {
-  int fd = -1;
-  ~Descriptor() {
-    if (fd >= 0) ::close(fd);
-  }
-};
 
 absl::Status Cancelled() { return absl::CancelledError("the tile was dropped"); }
 
@@ -71,7 +57,9 @@ absl::StatusOr<Blob> BlobCache::FromFolder(const Digest& digest) {
   }
   if (blob.Hash() != digest) {
     ::unlink(path.c_str());
-    return absl::NotFoundError("'" + path + "' was damaged and is removed");
+    const std::string text = "'" + path + "' was damaged and is removed; it is fetched again";
+    if (options_.warn) options_.warn(text);
+    return absl::NotFoundError(text);
   }
   std::lock_guard lock(mutex_);
   verified_.insert(digest);
@@ -95,9 +83,9 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
   const std::string part = path + ".part";
   Descriptor file;
   for (;;) {
-    file.fd = ::open(part.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0644);
-    if (file.fd < 0) return DiskError("cannot create", part, errno);
-    while (::flock(file.fd, LOCK_EX | LOCK_NB) != 0) {
+    file.Reset(::open(part.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0644));
+    if (!file.valid()) return DiskError("cannot create", part, errno);
+    while (::flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
       if (errno != EWOULDBLOCK && errno != EINTR) return DiskError("cannot lock", part, errno);
       if (progress && !progress()) return Cancelled();
       std::this_thread::sleep_for(std::chrono::milliseconds(50));
@@ -105,19 +93,18 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
     // Whoever had the lock may have finished the file or thrown it away.
     struct stat now {
     }, opened{};
-    if (::fstat(file.fd, &opened) == 0 && ::stat(part.c_str(), &now) == 0 &&
+    if (::fstat(file.get(), &opened) == 0 && ::stat(part.c_str(), &now) == 0 &&
         now.st_ino == opened.st_ino) {
       break;
     }
-    ::close(file.fd);
-    file.fd = -1;
+    file.Reset();
     if (::access(path.c_str(), F_OK) == 0) return absl::OkStatus();
   }
   struct stat info {};
-  if (::fstat(file.fd, &info) != 0) return DiskError("cannot examine", part, errno);
+  if (::fstat(file.get(), &info) != 0) return DiskError("cannot examine", part, errno);
   uint64_t have = static_cast<uint64_t>(info.st_size);
   Sha256 hash;
-  FP_RETURN_IF_ERROR(HashStart(file.fd, have, part, hash));
+  FP_RETURN_IF_ERROR(HashStart(file.get(), have, part, hash));
 
   uint64_t total = have;
   const auto throw_away = [&](const absl::Status& status) {
@@ -136,14 +123,7 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
         if (have > size || data.size() > size - have) {
           return absl::DataLossError("blob " + digest.Hex() + " is longer than announced");
         }
-        size_t done = 0;
-        while (done < data.size()) {
-          const ssize_t n = ::pwrite(file.fd, data.data() + done, data.size() - done,
-                                     static_cast<off_t>(have + done));
-          if (n < 0 && errno == EINTR) continue;
-          if (n <= 0) return DiskError("cannot write", part, n == 0 ? ENOSPC : errno);
-          done += static_cast<size_t>(n);
-        }
+        FP_RETURN_IF_ERROR(WriteAllAt(file.get(), have, data, part));
         hash.Update(data);
         have += data.size();
         return absl::OkStatus();
@@ -161,7 +141,7 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
   if (hash.Finish() != digest) {
     return throw_away(absl::DataLossError("blob " + digest.Hex() + " arrived with other contents"));
   }
-  if (::fsync(file.fd) != 0) return DiskError("cannot flush", part, errno);
+  if (::fsync(file.get()) != 0) return DiskError("cannot flush", part, errno);
   if (::rename(part.c_str(), path.c_str()) != 0) return DiskError("cannot rename to", path, errno);
   std::lock_guard lock(mutex_);
   verified_.insert(digest);

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <set>
@@ -20,6 +21,8 @@ struct BlobCacheOptions {
   std::string directory;                        // created if absent
   uint64_t max_bytes = uint64_t{64} << 30;      // the least recently used go first
   uint64_t max_blob_bytes = uint64_t{1} << 36;  // larger ones are refused before they are fetched
+  // Told what the owner of the disk should know; may be empty. From any thread.
+  std::function<void(const std::string&)> warn;
 };
 
 class BlobCache final : public BlobSource {

@@ -1,19 +1,16 @@
 // farpoint-worker: flags, log, signals. Everything else is the worker's.
-#include <pthread.h>
-#include <spdlog/sinks/stdout_color_sinks.h>
-#include <spdlog/spdlog.h>
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
 #include <atomic>
 #include <chrono>
-#include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <string>
 #include <thread>
 
 #include "core/base/executor.h"
+#include "proto/service_main.h"
 #include "worker/blob_cache.h"
 #include "worker/fingerprint.h"
 #include "worker/grpc_link.h"
@@ -23,9 +20,7 @@
 namespace farpoint {
 namespace {
 
-constexpr int kExitUsage = 2;
-constexpr int kExitPermanent = 42;
-constexpr int kExitTryAgain = 75;
+constexpr const char* kProgram = "farpoint-worker";
 
 struct WorkerFlags {
   std::string coordinator, cache, name, log_level = "info";
@@ -51,11 +46,6 @@ std::string DefaultName() {
   return std::string(host) + ":" + std::to_string(::getpid());
 }
 
-int ExitCodeOf(const absl::Status& status) {
-  return absl::IsUnavailable(status) || absl::IsResourceExhausted(status) ? kExitTryAgain
-                                                                          : kExitPermanent;
-}
-
 void DefineFlags(CLI::App& app, WorkerFlags& flags) {
   app.set_version_flag("--version", "farpoint-worker " FARPOINT_VERSION);
   app.set_config("--config", "", "Flags from a file: one NAME=VALUE a line, without the dashes");
@@ -76,27 +66,12 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
       ->check(CLI::Range(0, 86400))
       ->capture_default_str();
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
-      ->check(CLI::IsMember({"trace", "debug", "info", "warn", "warning", "error", "off"}))
+      ->check(CLI::IsMember(LogLevelNames()))
       ->capture_default_str();
 }
 
 void LogEntry(const WorkerLogEntry& entry) {
-  std::string line;
-  if (!entry.job.empty()) line += "job=" + entry.job.value + " ";
-  if (entry.tile) line += "tile=" + std::to_string(*entry.tile) + " ";
-  if (entry.attempt != 0) line += "attempt=" + std::to_string(entry.attempt) + " ";
-  line += entry.text;
-  switch (entry.level) {
-    case WorkerLogEntry::Level::kInfo:
-      spdlog::info("{}", line);
-      break;
-    case WorkerLogEntry::Level::kWarning:
-      spdlog::warn("{}", line);
-      break;
-    case WorkerLogEntry::Level::kError:
-      spdlog::error("{}", line);
-      break;
-  }
+  WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, {}, entry.text));
 }
 
 int Main(int argc, char** argv) {
@@ -108,31 +83,27 @@ int Main(int argc, char** argv) {
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : kExitUsage;
+    return app.exit(error) == 0 ? 0 : kServiceExitUsage;
   }
   if (flags.cache.empty()) {
     std::fprintf(stderr, "farpoint-worker: there is no home folder; give --cache DIR\n");
-    return kExitUsage;
+    return kServiceExitUsage;
   }
-  spdlog::set_default_logger(spdlog::stderr_color_mt("farpoint-worker"));
-  spdlog::set_level(spdlog::level::from_str(flags.log_level));
-
-  // Before any thread starts, so that all inherit the mask and only the waiting one hears them.
-  sigset_t signals;
-  sigemptyset(&signals);
-  sigaddset(&signals, SIGTERM);
-  sigaddset(&signals, SIGINT);
-  ::pthread_sigmask(SIG_BLOCK, &signals, nullptr);
-  std::signal(SIGPIPE, SIG_IGN);
+  if (const absl::Status bad =
+          CheckHostPort("--coordinator", flags.coordinator, /*any_port=*/false);
+      !bad.ok()) {
+    ReportFatal(kProgram, bad);
+    return kServiceExitUsage;
+  }
+  StartLog(kProgram, flags.log_level);
+  const StopSignals signals;
 
   WorkerOptions options;
   {
     Executor executor(flags.threads);
     const absl::StatusOr<Digest> fingerprint = ComputeFingerprint(executor);
     if (!fingerprint.ok()) {
-      std::fprintf(stderr, "farpoint-worker: the self-test failed: %s\n",
-                   fingerprint.status().ToString().c_str());
-      return ExitCodeOf(fingerprint.status());
+      return ReportFatal(kProgram, Annotate(fingerprint.status(), "the self-test failed"));
     }
     options.fingerprint = *fingerprint;
   }
@@ -144,33 +115,29 @@ int Main(int argc, char** argv) {
 
   const std::unique_ptr<GrpcLink> link = GrpcLink::Connect(flags.coordinator);
   const absl::StatusOr<std::unique_ptr<BlobCache>> cache =
-      BlobCache::Open({.directory = flags.cache, .max_bytes = flags.cache_bytes}, *link);
-  if (!cache.ok()) {
-    std::fprintf(stderr, "farpoint-worker: --cache: %s\n", cache.status().ToString().c_str());
-    return ExitCodeOf(cache.status());
-  }
+      BlobCache::Open({.directory = flags.cache,
+                       .max_bytes = flags.cache_bytes,
+                       .warn = [](const std::string& text) { WriteLog(LogLevel::kWarning, text); }},
+                      *link);
+  if (!cache.ok()) return ReportFatal(kProgram, Annotate(cache.status(), "--cache"));
   const std::unique_ptr<TileRenderer> renderer = MakeCoreRenderer();
   Worker worker(std::move(options), *link, **cache, *renderer);
-  spdlog::info("farpoint-worker {} for {}, cache '{}'", FARPOINT_VERSION, flags.coordinator,
-               flags.cache);
+  WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " for " +
+                                flags.coordinator + ", cache '" + flags.cache + "'");
 
   std::atomic<bool> ended = false;
   std::thread stopper([&] {
-    const timespec slice{.tv_sec = 0, .tv_nsec = 100'000'000};
     while (!ended.load()) {
-      if (::sigtimedwait(&signals, nullptr, &slice) <= 0) continue;
-      spdlog::info("stopping: the tile in work is finished or given back");
+      if (!signals.Wait(std::chrono::milliseconds(100))) continue;
+      WriteLog(LogLevel::kInfo, "stopping: the tile in work is finished or given back");
       worker.Stop();
     }
   });
   const absl::Status status = worker.Run();
   ended = true;
   stopper.join();
-  if (!status.ok()) {
-    std::fprintf(stderr, "farpoint-worker: %s\n", status.ToString().c_str());
-    return ExitCodeOf(status);
-  }
-  spdlog::info("stopped");
+  if (!status.ok()) return ReportFatal(kProgram, status);
+  WriteLog(LogLevel::kInfo, "stopped");
   return 0;
 }
 

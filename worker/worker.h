@@ -15,7 +15,8 @@
 namespace farpoint {
 
 struct WorkerLogEntry {
-  enum class Level { kInfo, kWarning, kError } level = Level::kInfo;
+  using Level = LogLevel;
+  Level level = Level::kInfo;
   std::string text;
   JobId job;  // may be empty
   std::optional<uint32_t> tile;

@@ -1,0 +1,52 @@
+// What the main programs of the services share: exit codes, addresses, the log, signals to stop.
+// For main.cc only: libraries neither log nor exit.
+#pragma once
+
+#include <chrono>
+#include <csignal>
+#include <cstdint>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "core/base/status.h"
+#include "proto/job.h"
+
+namespace farpoint {
+
+inline constexpr int kServiceExitUsage = 2;
+inline constexpr int kServiceExitPermanent = 42;
+inline constexpr int kServiceExitTryAgain = 75;
+
+// By core/base/status.h.
+int ServiceExitCode(const absl::Status& status);
+// "PROGRAM: message" on stderr; returns the exit code.
+int ReportFatal(std::string_view program, const absl::Status& status);
+
+// HOST:PORT with a port of 1..65535, or 0 if `any_port`; a host of colons stands in brackets.
+// kInvalidArgument says what is wrong with `flag`.
+absl::Status CheckHostPort(std::string_view flag, const std::string& address, bool any_port);
+
+// What --log-level takes.
+std::vector<std::string> LogLevelNames();
+// Lines go to stderr from here on.
+void StartLog(const std::string& program, const std::string& level);
+void WriteLog(LogLevel level, const std::string& line);
+// "job=… tile=… attempt=… worker=… text"; what is empty or 0 is left out.
+std::string LogText(const JobId& job, std::optional<uint32_t> tile, uint32_t attempt,
+                    const WorkerId& worker, std::string_view text);
+
+// SIGTERM and SIGINT, heard only by whoever waits. Construct before any thread starts, so that all
+// inherit it. SIGPIPE is ignored, too.
+class StopSignals {
+ public:
+  StopSignals();
+  // True if one came within `timeout`. One thread at a time.
+  bool Wait(std::chrono::milliseconds timeout) const;
+
+ private:
+  sigset_t signals_;
+};
+
+}  // namespace farpoint
