@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <cstring>
 #include <functional>
 #include <set>
 
@@ -95,6 +96,52 @@ TEST_P(PointTreeSize, IsTheSameForAnyNumberOfThreads) {
 }
 
 INSTANTIATE_TEST_SUITE_P(Sizes, PointTreeSize, testing::Values(1, 7, 8, 9, 64, 65, 1000, 20000));
+
+TEST_P(PointTreeSize, SidesThatALightOpensEqualThoseThatAreOpen) {
+  // The same visible sides, once as open ones in the topology, once named by the radiance.
+  const TestCloud t = RandomCloud(GetParam(), 7);
+  Executor executor(2);
+  const auto whole = PointTree::Build(t.cloud, t.shading, executor);
+  for (const unsigned hidden : {1u, 3u, 255u}) {
+    SurfelSides open = t.shading.visible_sides;
+    for (size_t i = 0; i < open.size(); ++i) {
+      const unsigned bits = static_cast<unsigned>(HashKey(hidden, i)) & hidden;
+      if (hidden == 255) {
+        open[i] = 0;
+      } else if (i % 5 == 0) {
+        open[i] = static_cast<uint8_t>(open[i] & ~bits);
+      }
+    }
+    const auto topology = PointTree::BuildTopology(t.cloud, open, executor);
+    const Blob radiance = PointTree::BuildRadiance(topology, t.cloud, open, t.shading, executor);
+    const auto a = PointTree::FromBlobs(whole.topology, whole.radiance).value();
+    const auto b = PointTree::FromBlobs(topology.blob, radiance).value();
+    ASSERT_EQ(a->groups().size(), b->groups().size());
+    for (uint32_t g = 0; g < a->groups().size(); ++g) {
+      ASSERT_EQ(std::memcmp(&a->group(g), &b->group(g), sizeof(NodeGroup)), 0) << g;
+      ASSERT_EQ(std::memcmp(&a->radiance(g), &b->radiance(g), sizeof(RadianceGroup)), 0) << g;
+    }
+  }
+}
+
+TEST(PointTree, RefusesLitSidesThatNoTreeHas) {
+  TestCloud t = RandomCloud(20, 3);
+  Executor executor(1);
+  SurfelSides open(20, 0);
+  for (auto& v : t.shading.visible_sides) v = kFrontVisible;
+  const auto topology = PointTree::BuildTopology(t.cloud, open, executor);
+  const Blob radiance = PointTree::BuildRadiance(topology, t.cloud, open, t.shading, executor);
+  ASSERT_TRUE(PointTree::FromBlobs(topology.blob, radiance).ok());
+  const auto bytes = radiance.bytes();
+  // Twenty entries behind the header, the count and the padding.
+  for (const uint32_t wrong : {40u, 3u, ~0u}) {
+    std::vector<std::byte> changed(bytes.begin(), bytes.end());
+    std::memcpy(changed.data() + 64 + 5 * 4, &wrong, 4);
+    const auto tree = PointTree::FromBlobs(topology.blob, Blob::FromVector(changed));
+    ASSERT_FALSE(tree.ok()) << wrong;
+    EXPECT_NE(std::string(tree.status().message()).find("lit sides"), std::string::npos);
+  }
+}
 
 TEST(PointTree, OfNothingIsEmpty) {
   const auto tree = TestCloud().Build();
