@@ -1004,10 +1004,11 @@ std::array<Vec2f, 3> PreparedScene::CornerUvs(uint32_t triangle, uint32_t set,
 // to look at, or the triangle reaches beyond the texture's edge, false.
 bool PreparedScene::IsBlack(int32_t texture, const std::array<Vec2f, 3>& corner) const {
   constexpr float kMaxSide = 256.0f;
+  constexpr float kReach = 0.51f;  // half a texel, and rounding
   const PreparedTexture& t = textures_[static_cast<size_t>(texture)];
   const auto range = [&](float a, float b, float c, uint32_t size, int64_t& first, int64_t& last) {
-    const float low = std::floor(std::min({a, b, c}) * static_cast<float>(size) - 1.0f);
-    const float high = std::ceil(std::max({a, b, c}) * static_cast<float>(size) + 1.0f);
+    const float low = std::floor(std::min({a, b, c}) * static_cast<float>(size) - kReach);
+    const float high = std::floor(std::max({a, b, c}) * static_cast<float>(size) + kReach);
     if (!(low >= -2.0f) || !(high <= static_cast<float>(size) + 2.0f) || !(high - low < kMaxSide)) {
       return false;
     }

@@ -33,6 +33,12 @@ class Lit {
 
   const PreparedScene& scene() const { return accel_->scene(); }
   const LightSampler& sampler() const { return *sampler_; }
+  // Whether something lies on the way from p by all but the end of v.
+  bool Hides(const Vec3d& p_world, const Vec3f& n, const Vec3d& v) const {
+    const double d = Length(v);
+    return accel_->Occluded(accel_->LeaveSurface(Local(p_world), n), Vec3f(v / d),
+                            static_cast<float>(d * (1 - 1e-4)));
+  }
   double surface_offset_m() const { return static_cast<double>(accel_->surface_offset_m()); }
   Vec3f Local(const Vec3d& p_world) const { return Vec3f(p_world - scene().origin()); }
 
@@ -478,6 +484,275 @@ TEST(Sky, BelowTheSurfaceIsDark) {
   EXPECT_NEAR(e.x, 0.75 * kPi, 0.005 * kPi);
   EXPECT_LT(counters.rays, 4096u);
   EXPECT_GT(counters.rays, 2048u);
+}
+
+// --- Many lights ---
+
+// Point and spot lights over a floor with walls, by the light tree and one by one.
+Scene ManyPunctualLights(int count, double scale = 1) {
+  Scene scene;
+  AddQuad(scene, FloorQuad(10 * scale), Material());
+  TestRandom random(21);
+  for (int i = 0; i < 6; ++i) {
+    const double x = random.Uniform(-8, 8), z = random.Uniform(-8, 8);
+    AddQuad(scene,
+            {Vec3d(x, 0, z) * scale, Vec3d(x + 1, 0, z + 1) * scale, Vec3d(x + 1, 2, z + 1) * scale,
+             Vec3d(x, 2, z) * scale},
+            Material());
+  }
+  for (int i = 0; i < count; ++i) {
+    PunctualLight light;
+    light.kind = i % 3 == 0 ? PunctualKind::kSpot : PunctualKind::kPoint;
+    light.position =
+        Vec3d(random.Uniform(-9, 9), random.Uniform(1, 3), random.Uniform(-9, 9)) * scale;
+    light.direction = Normalize(Vec3d(random.Uniform(-0.5, 0.5), -1, random.Uniform(-0.5, 0.5)));
+    light.inner_cone_rad = 0.4;
+    light.outer_cone_rad = 1.0;
+    light.range_m = i % 2 == 0 ? 0 : 5 * scale;
+    light.intensity = Rgb(static_cast<float>(std::exp2(random.Uniform(-3, 3)) * scale * scale));
+    if (i % 10 == 9) light.intensity = Rgb(0);
+    scene.lights.push_back(light);
+  }
+  return scene;
+}
+
+TEST(ManyLights, PunctualOnesAreDrawnWithoutBias) {
+  const Lit lit(ManyPunctualLights(300));
+  TestRandom random(22);
+  for (int i = 0; i < 12; ++i) {
+    const Vec3d p(random.Uniform(-8, 8), 0, random.Uniform(-8, 8));
+    // More samples than lights: one ray each, which is exact.
+    LightCounters exact;
+    const auto expected = static_cast<double>(lit.E(p, kUp, 512, 1, exact).x);
+    EXPECT_EQ(exact.rays + exact.skipped_facing_away, 270u);
+    for (const uint32_t samples : {1u, 32u}) {
+      LightCounters counters;
+      lit.E(p, kUp, samples, 1, counters);
+      EXPECT_EQ(counters.samples, samples);
+      EXPECT_LE(counters.rays + counters.skipped_facing_away, samples);
+      const Estimate e = OverKeys(lit, p, kUp, 2000, samples);
+      EXPECT_NEAR(e.mean(), expected, 4 * e.standard_error() + 1e-5 * expected) << i;
+      if (samples == 32) EXPECT_LT(std::sqrt(e.variance()), 0.2 * expected);
+    }
+  }
+}
+
+TEST(ManyLights, FewHaveARayEachAndNoNoise) {
+  const Lit lit(ManyPunctualLights(8));
+  for (uint64_t key = 0; key < 10; ++key) {
+    EXPECT_EQ(lit.E({1, 0, 2}, kUp, 1, key), lit.E({1, 0, 2}, kUp, 64, 0));
+  }
+}
+
+TEST(ManyLights, DirectionalOnesAreDrawnByWhatTheySend) {
+  Scene scene;
+  AddQuad(scene, FloorQuad(10), Material());
+  AddQuad(scene, {Vec3d(2, 0, -10), Vec3d(2, 0, 10), Vec3d(2, 5, 10), Vec3d(2, 5, -10)},
+          Material());
+  TestRandom random(23);
+  for (int i = 0; i < 500; ++i) {
+    PunctualLight light;
+    light.kind = PunctualKind::kDirectional;
+    light.direction = random.Direction();
+    light.intensity = Rgb(static_cast<float>(std::exp2(random.Uniform(-4, 4))));
+    scene.lights.push_back(light);
+  }
+  const Lit lit(scene);
+  for (const Vec3d& p : {Vec3d(1.9, 0, 0), Vec3d(-3, 0, 1), Vec3d(5, 0, 3)}) {
+    const auto expected = static_cast<double>(lit.E(p, kUp, 512).x);
+    for (const uint32_t samples : {1u, 32u}) {
+      LightCounters counters;
+      lit.E(p, kUp, samples, 1, counters);
+      EXPECT_LE(counters.rays, samples);
+      const Estimate e = OverKeys(lit, p, kUp, 2000, samples);
+      EXPECT_NEAR(e.mean(), expected, 4 * e.standard_error() + 1e-5 * expected);
+    }
+  }
+}
+
+// Emitters of all sizes around a floor with walls: a tiny one 10^6 times brighter, a huge dim one,
+// many between.
+Scene ManyEmitters(int count) {
+  Scene scene;
+  AddQuad(scene, FloorQuad(10), Material());
+  AddQuad(scene, {Vec3d(2, 0, -3), Vec3d(2, 0, 3), Vec3d(2, 2, 3), Vec3d(2, 2, -3)}, Material());
+  TestRandom random(24);
+  for (int i = 0; i < count; ++i) {
+    const Vec3d at(random.Uniform(-9, 9), random.Uniform(1, 4), random.Uniform(-9, 9));
+    const Vec3d a = random.Direction() * std::exp2(random.Uniform(-6, -1));
+    const Vec3d b = random.Direction() * Length(a);
+    AddQuad(scene, {at, at + a, at + a + b, at + b},
+            Emitting(static_cast<float>(std::exp2(random.Uniform(-4, 4)))));
+  }
+  AddQuad(scene, FloorQuad(10, 6), Emitting(0.05f));
+  const Vec3d at(-1, 3, 1);
+  AddQuad(scene, {at, at + Vec3d(2e-3, 0, 0), at + Vec3d(2e-3, 0, 2e-3), at + Vec3d(0, 0, 2e-3)},
+          Emitting(1e6f));
+  return scene;
+}
+
+TEST(ManyLights, EmittersOfAllSizesAreDrawnWithoutBias) {
+  const Lit lit(ManyEmitters(150));
+  const std::pair<Vec3d, Vec3f> points[] = {
+      {{0, 0, 0}, kUp}, {{2.5, 0, 0.5}, kUp}, {{-6, 0, 5}, kUp}, {{2, 1, 0}, {-1, 0, 0}}};
+  for (const auto& [p, n] : points) {
+    const PreparedScene& scene = lit.scene();
+    // A plain point on each of the triangles.
+    Estimate plain;
+    TestRandom random(25);
+    const Vec3d local(lit.Local(p));
+    for (int i = 0; i < 1500; ++i) {
+      double sum = 0;
+      for (const uint32_t t : scene.emissive_triangles()) {
+        const auto [b1, b2] = random.Barycentric();
+        const Vec3d v =
+            Vec3d(scene.PointOn(t, static_cast<float>(b1), static_cast<float>(b2))) - local;
+        const double d = Length(v), cos_p = Dot(Vec3d(n), v) / d;
+        const double cos_l = std::fabs(Dot(Vec3d(scene.GeometricNormal(t)), v)) / d;
+        if (cos_p <= 0 || lit.Hides(p, n, v)) continue;
+        sum += static_cast<double>(scene.MaterialOf(t).emission.x) * cos_p * cos_l / (d * d) *
+               static_cast<double>(scene.TriangleArea(t));
+      }
+      plain.Add(sum);
+    }
+    for (const uint32_t samples : {1u, 32u}) {
+      const Estimate e = OverKeys(lit, p, n, 4000, samples);
+      const double error = std::hypot(e.standard_error(), plain.standard_error());
+      EXPECT_NEAR(e.mean(), plain.mean(), 4 * error) << p.x << " " << samples;
+      EXPECT_LT(error, 0.03 * plain.mean());
+      if (samples == 32) EXPECT_LT(std::sqrt(e.variance()), 0.15 * plain.mean());
+    }
+  }
+}
+
+// Every wall emits: E = pi L everywhere, and near it with few samples.
+TEST(ManyLights, AFurnaceOfEmittersGivesPiL) {
+  Scene scene;
+  const double h = 2;
+  const Vec3d c[8] = {{-h, -h, -h}, {h, -h, -h}, {h, h, -h}, {-h, h, -h},
+                      {-h, -h, h},  {h, -h, h},  {h, h, h},  {-h, h, h}};
+  for (const auto& f : {std::array{0, 1, 2, 3},
+                        {4, 5, 6, 7},
+                        {0, 1, 5, 4},
+                        {2, 3, 7, 6},
+                        {0, 3, 7, 4},
+                        {1, 2, 6, 5}}) {
+    AddQuad(scene, {c[f[0]], c[f[1]], c[f[2]], c[f[3]]}, Emitting(3));
+  }
+  const Lit lit(scene);
+  TestRandom random(26);
+  for (int i = 0; i < 30; ++i) {
+    Vec3d p(random.Uniform(-h, h), random.Uniform(-h, h), random.Uniform(-h, h));
+    Vec3d n;
+    p[i % 3] = i % 2 == 0 ? -h : h;
+    n[i % 3] = i % 2 == 0 ? 1 : -1;
+    const Estimate e = OverKeys(lit, p, Vec3f(n), 100, 32);
+    EXPECT_NEAR(e.mean(), 3 * kPi, 4 * e.standard_error() + 0.002 * 3 * kPi);
+    EXPECT_LT(std::sqrt(e.variance()), 0.1 * 3 * kPi);
+  }
+}
+
+// A texture that is black but for one corner, over many triangles: only those with light count.
+TEST(ManyLights, BlackPartsOfATextureAreNoLights) {
+  Scene scene;
+  Texture texture;
+  std::vector<uint8_t> pixels;
+  for (int y = 0; y < 16; ++y) {
+    for (int x = 0; x < 16; ++x) {
+      const auto v = static_cast<uint8_t>(x < 2 && y < 2 ? 255 : 0);
+      pixels.insert(pixels.end(), {v, v, v, 255});
+    }
+  }
+  texture.encoded = Blob::FromString(MakePng(16, 16, pixels));
+  texture.wrap_s = texture.wrap_t = WrapMode::kClampToEdge;
+  texture.nearest = true;
+  scene.textures.push_back(texture);
+  Material material = Emitting(5);
+  material.emission_texture.texture = 0;
+  Mesh mesh;
+  for (int y = 0; y <= 16; ++y) {
+    for (int x = 0; x <= 16; ++x) {
+      const auto u = static_cast<float>(x) / 16, v = static_cast<float>(y) / 16;
+      mesh.positions.push_back({u * 2 - 1, 1, v * 2 - 1});
+      mesh.uv[0].push_back({u, v});
+    }
+  }
+  for (uint32_t y = 0; y < 16; ++y) {
+    for (uint32_t x = 0; x < 16; ++x) {
+      const uint32_t a = y * 17 + x;
+      mesh.triangles.push_back({a, a + 1, a + 18});
+      mesh.triangles.push_back({a, a + 18, a + 17});
+    }
+  }
+  mesh.material = 0;
+  scene.materials.push_back(material);
+  scene.instances.push_back({"panel", 0, {}});
+  scene.meshes.push_back(mesh);
+  const Lit lit(scene);
+  const Quad lit_part = {Vec3d(-1, 1, -1), Vec3d(-0.75, 1, -1), Vec3d(-0.75, 1, -0.75),
+                         Vec3d(-1, 1, -0.75)};
+  const Vec3d p(0.3, 0, 0.4);
+  const double expected = 5 * PolygonIrradiance(lit_part, p, {0, 1, 0});
+  ExpectIrradiance(lit, p, kUp, expected, 32);
+  // With all 512 triangles drawn alike, 4 of 32 rays would hit: the error would be far larger.
+  EXPECT_LT(std::sqrt(OverKeys(lit, p, kUp, 200, 32).variance()), 0.1 * expected);
+}
+
+TEST(ManyLights, ScaleExactlyByPowersOfTwo) {
+  const Lit one(ManyPunctualLights(200)), other(ManyPunctualLights(200, 0x1p-7));
+  TestRandom random(27);
+  for (int i = 0; i < 200; ++i) {
+    const Vec3d p(random.Uniform(-8, 8), 0, random.Uniform(-8, 8));
+    EXPECT_EQ(one.E(p, kUp, 16, static_cast<uint64_t>(i)),
+              other.E(p * 0x1p-7, kUp, 16, static_cast<uint64_t>(i)));
+  }
+}
+
+// --- Environment maps ---
+
+TEST(Map, AMapOfOneColourIsTheSameSky) {
+  Scene sky, map;
+  for (Scene* scene : {&sky, &map}) {
+    AddQuad(*scene, FloorQuad(5), Material());
+    AddQuad(*scene, {Vec3d(1, 0, -3), Vec3d(1, 0, 3), Vec3d(1, 5, 3), Vec3d(1, 5, -3)}, Material());
+  }
+  sky.environment.sky = {1, 2, 0.3f};
+  map.environment.map.assign(32, {1, 2, 0.3f});
+  map.environment.map_width = 8;
+  map.environment.map_height = 4;
+  const Lit a(sky), b(map);
+  for (const Vec3d& p : {Vec3d(0, 0, 0), Vec3d(0.9, 0, 1), Vec3d(3, 0, 0)}) {
+    EXPECT_EQ(a.E(p, kUp), b.E(p, kUp));
+  }
+  // One texel a little brighter: no longer a sky, and drawn by the map's own sampler.
+  map.environment.map[0] = Rgb(1.001f, 2.002f, 0.3003f);
+  const Lit c(map);
+  for (const Vec3d& p : {Vec3d(0, 0, 0), Vec3d(0.9, 0, 1), Vec3d(3, 0, 0)}) {
+    const Estimate e = OverKeys(a, p, kUp, 200, 64), f = OverKeys(c, p, kUp, 200, 64);
+    EXPECT_NEAR(e.mean(), f.mean(),
+                4 * std::hypot(e.standard_error(), f.standard_error()) + 1e-3 * e.mean());
+  }
+}
+
+TEST(Map, IsShadowedAndCounted) {
+  Scene scene;
+  AddQuad(scene, FloorQuad(5), Material());
+  AddQuad(scene, FloorQuad(4, 2), Material());
+  scene.environment.map = {Rgb(3), Rgb(1), Rgb(3), Rgb(1)};
+  scene.environment.map_width = scene.environment.map_height = 2;
+  const Lit lit(scene);
+  EXPECT_TRUE(lit.sampler().has_sky());
+  EXPECT_TRUE(lit.sampler().any_light());
+  LightCounters counters;
+  const double below = static_cast<double>(lit.E({0, 0, 0}, kUp, 256, 1, counters).x);
+  EXPECT_EQ(counters.samples, 256u);
+  EXPECT_EQ(counters.rays + counters.skipped_facing_away, 256u);
+  EXPECT_GT(counters.rays, 200u);
+  const double above = static_cast<double>(lit.E({0, 2, 0}, kUp, 256).x);
+  EXPECT_GT(below, 0);
+  EXPECT_LT(below, 0.4 * above);
+  // On average 2 over the hemisphere: the map depends on the longitude only.
+  EXPECT_NEAR(above, 2 * kPi, 0.03 * 2 * kPi);
 }
 
 // --- The estimator ---

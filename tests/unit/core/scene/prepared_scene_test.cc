@@ -498,6 +498,103 @@ TEST(PreparedScene, PlacesLightsAboutTheOrigin) {
   EXPECT_THAT(MessageOf(scene), HasSubstr("2^60 m away"));
 }
 
+Scene MapScene(const std::vector<Rgb>& map, uint32_t width) {
+  Scene scene = TriangleScene();
+  scene.environment.map = map;
+  scene.environment.map_width = width;
+  scene.environment.map_height = static_cast<uint32_t>(map.size()) / width;
+  return scene;
+}
+
+TEST(PreparedScene, KeepsTheTexelsOfAnEnvironmentMap) {
+  const std::vector<Rgb> halves = {{1, 2, 3}, {0.25f, 65504, 0}, {0, 0, 0x1p-24f}, Rgb(7)};
+  std::vector<Rgb> floats = halves;
+  floats[3].z = 0.1f;
+  const Prepared of_halves = PrepareOk(MapScene(halves, 2));
+  const Prepared of_floats = PrepareOk(MapScene(floats, 2));
+  for (uint32_t i = 0; i < 4; ++i) {
+    EXPECT_EQ(of_halves->MapTexel(i % 2, i / 2), halves[i]);
+    EXPECT_EQ(of_floats->MapTexel(i % 2, i / 2), floats[i]);
+  }
+  EXPECT_TRUE(of_halves->has_environment_map());
+  EXPECT_EQ(of_halves->map_width(), 2u);
+  EXPECT_EQ(of_halves->map_height(), 2u);
+  EXPECT_LT(of_halves->blob().size(), of_floats->blob().size());
+}
+
+TEST(PreparedScene, LooksUpAnEnvironmentMapBilinearly) {
+  Scene scene = MapScene({Rgb(0), Rgb(4), Rgb(8), Rgb(16)}, 2);
+  scene.environment.sky = Rgb(100);
+  const Prepared p = PrepareOk(scene);
+  EXPECT_EQ(p->sky(), Rgb(100));
+  EXPECT_EQ(p->MapAt(0.5, 0.5), Rgb(0));
+  EXPECT_EQ(p->MapAt(1.5, 1.5), Rgb(16));
+  EXPECT_EQ(p->MapAt(1, 0.5), Rgb(2));
+  EXPECT_EQ(p->MapAt(0, 0.5), Rgb(2));  // around
+  EXPECT_EQ(p->MapAt(2, 0.5), Rgb(2));
+  EXPECT_EQ(p->MapAt(1, 1), Rgb(7));
+  EXPECT_EQ(p->MapAt(1.5, 0), Rgb(4));  // held at the edge
+  EXPECT_EQ(p->MapAt(0.5, 2), Rgb(8));
+  EXPECT_EQ(p->EnvironmentRadiance({0, 0, 1}), Rgb(107));
+}
+
+TEST(PreparedScene, AMapOfOneColourIsSky) {
+  Scene scene = MapScene(std::vector<Rgb>(6, Rgb(1, 2, 3)), 3);
+  scene.environment.sky = {1, 1, 0};
+  const Prepared p = PrepareOk(scene);
+  EXPECT_FALSE(p->has_environment_map());
+  EXPECT_EQ(p->sky(), Rgb(2, 3, 3));
+  EXPECT_EQ(p->EnvironmentRadiance({0, 1, 0}), Rgb(2, 3, 3));
+  scene.environment.map.assign(6, Rgb());
+  EXPECT_EQ(PrepareOk(scene)->sky(), Rgb(1, 1, 0));
+}
+
+TEST(PreparedScene, RefusesABadEnvironment) {
+  const Scene good = MapScene({Rgb(0), Rgb(4), Rgb(8), Rgb(16)}, 2);
+  Scene scene = good;
+  scene.environment.sky.y = -1;
+  EXPECT_THAT(MessageOf(scene), HasSubstr("sky"));
+  scene = good;
+  scene.environment.map[2].z = std::numeric_limits<float>::quiet_NaN();
+  EXPECT_THAT(MessageOf(scene), HasSubstr("texel (0, 1)"));
+  scene = good;
+  scene.environment.map_width = 3;
+  EXPECT_THAT(MessageOf(scene), HasSubstr("4 texels for 3 x 2"));
+  scene = good;
+  scene.environment.world_from_map[0] = {-1, 0, 0};
+  EXPECT_THAT(MessageOf(scene), HasSubstr("orthonormal"));
+}
+
+TEST(PreparedScene, MeanEmissionIsZeroOnlyForBlackTriangles) {
+  // Left half black, right half white: the triangle's uvs decide.
+  std::vector<uint8_t> pixels;
+  for (int i = 0; i < 16; ++i) {
+    for (int c = 0; c < 3; ++c) pixels.push_back(i % 4 < 2 ? 0 : 255);
+    pixels.push_back(255);
+  }
+  const auto mean = [&](const std::array<Vec2f, 3>& uv) {
+    Scene scene = TexturedScene(4, 4, pixels);
+    scene.textures[0].nearest = true;
+    scene.materials[0].emission = {2, 0, 4};
+    scene.materials[0].emission_texture.texture = 0;
+    scene.meshes[0].positions.resize(3);
+    scene.meshes[0].normals.clear();
+    scene.meshes[0].uv[0].assign(uv.begin(), uv.end());
+    scene.meshes[0].uv[1].clear();
+    scene.meshes[0].triangles = {{0, 1, 2}};
+    return PrepareOk(scene)->MeanEmission(0);
+  };
+  const Rgb all = mean({Vec2f{0.8f, 0.1f}, Vec2f{0.9f, 0.1f}, Vec2f{0.8f, 0.9f}});
+  EXPECT_FLOAT_EQ(all.x, 2);
+  EXPECT_FLOAT_EQ(all.z, 4);
+  EXPECT_EQ(mean({Vec2f{0.28f, 0.4f}, Vec2f{0.29f, 0.4f}, Vec2f{0.28f, 0.41f}}), Rgb());
+  const Rgb half = mean({Vec2f{0, 0}, Vec2f{1, 0}, Vec2f{0, 1}});
+  EXPECT_NEAR(half.x, 0.5, 0.15);  // a quarter of the triangle is white
+  EXPECT_EQ(half.y, 0);
+  // Beyond the texture it is not looked for black, but never taken for it.
+  EXPECT_GT(mean({Vec2f{4.1f, 0.1f}, Vec2f{4.2f, 0.1f}, Vec2f{4.1f, 0.2f}}).x, 0);
+}
+
 TEST(PreparedScene, IsEmptyForAnEmptyScene) {
   const Prepared p = PrepareOk(Scene());
   EXPECT_EQ(p->triangles().size(), 0u);
@@ -512,6 +609,8 @@ Scene BlobScene() {
   scene.materials[0].alpha_mode = AlphaMode::kMask;
   scene.materials[0].alpha_cutoff = 0.5f;
   scene.materials[0].emission = {1, 2, 3};
+  scene.environment.map = {Rgb(1), Rgb(2), Rgb(3), Rgb(4)};
+  scene.environment.map_width = scene.environment.map_height = 2;
   scene.meshes.push_back(scene.meshes[0]);
   scene.meshes[1].normals.clear();
   scene.meshes[1].material = -1;
@@ -587,6 +686,7 @@ TEST(PreparedSceneBlob, SurvivesEveryFlippedBit) {
     }
     ++accepted;
     const PreparedScene& p = **result;
+    ASSERT_TRUE(IsFinite(p.EnvironmentRadiance({0.6f, 0.64f, 0.48f})));
     for (uint32_t t = 0; t < p.triangles().size(); ++t) {
       for (const auto& [b1, b2] : {std::pair{0.0f, 0.0f}, {0.3f, 0.6f}, {1.0f, 0.0f}}) {
         const SurfaceSample s = p.Surface(t, b1, b2);
@@ -597,6 +697,7 @@ TEST(PreparedSceneBlob, SurvivesEveryFlippedBit) {
       }
       ASSERT_GT(p.TriangleArea(t), 0);
       ASSERT_NEAR(Length(p.GeometricNormal(t)), 1, 1e-5);
+      ASSERT_TRUE(IsFinite(p.MeanEmission(t)));
     }
   }
   EXPECT_GT(refused, 1000u);
