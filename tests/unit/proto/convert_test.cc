@@ -87,6 +87,15 @@ TEST(Convert, JobSurvivesTheWire) {
   EXPECT_EQ(back->overrides.suns.size(), 2u);
   EXPECT_EQ(back->overrides.albedo, job.overrides.albedo);
   EXPECT_EQ(back->light_units, LightUnits::kRaw);
+  EXPECT_EQ(back->overrides.lights[0].outer_cone_rad, job.overrides.lights[0].outer_cone_rad);
+  EXPECT_EQ(back->overrides.environment->up, job.overrides.environment->up);
+  EXPECT_EQ(back->overrides.materials[1].emission, job.overrides.materials[1].emission);
+  EXPECT_FALSE(back->overrides.materials[1].base_color.has_value());
+  EXPECT_EQ(back->frames, job.frames);
+  EXPECT_EQ(back->fps, job.fps);
+  EXPECT_EQ(back->after, job.after);
+  EXPECT_TRUE(back->start_paused);
+  EXPECT_EQ(back->settings.filter, PixelFilter::kGaussian);
 }
 
 TEST(Convert, JobSurvivesItsFile) {
@@ -106,34 +115,6 @@ TEST(Convert, AbsentFieldsAreDefaults) {
   EXPECT_EQ(job->film.width, 0);
   EXPECT_TRUE(std::holds_alternative<std::monostate>(job->camera));
   EXPECT_EQ(job->limits, JobLimits());
-}
-
-TEST(Convert, JobFileAcceptsBothNamings) {
-  const absl::StatusOr<v1::RenderJob> job = RenderJobFromJson(
-      R"({"asset": {"root": "a.glb"}, "settings": {"light_samples": 3, "tilePx": 32,
-          "integrator": "INTEGRATOR_PT", "seed": "18446744073709551615"},
-          "film": {"width_px": 8, "heightPx": 9}})",
-      "job.json");
-  ASSERT_TRUE(job.ok()) << job.status();
-  EXPECT_EQ(job->settings().light_samples(), 3u);
-  EXPECT_EQ(job->settings().tile_px(), 32u);
-  EXPECT_EQ(job->settings().seed(), 18446744073709551615u);
-  EXPECT_EQ(job->film().height_px(), 9u);
-}
-
-TEST(Convert, JobFileNamesTheNearestField) {
-  const auto job = RenderJobFromJson(R"({"settings": {"light_sampels": 3}})", "my.json");
-  ASSERT_TRUE(absl::IsInvalidArgument(job.status()));
-  EXPECT_THAT(std::string(job.status().message()), HasSubstr("my.json"));
-  EXPECT_THAT(std::string(job.status().message()), HasSubstr("did you mean 'light_samples'?"));
-}
-
-TEST(Convert, JobFileRefusesWhatIsNoJob) {
-  for (const char* text : {"", "[]", "{", "3", R"({"settings": 3})", R"({"settings": {"spp": -1}})",
-                           R"({"settings": {"spp": 4294967296}})", R"({"title": "x"} trailing)",
-                           R"({"settings": {"integrator": "fpbgi2"}})", "\xff\xfe"}) {
-    EXPECT_TRUE(absl::IsInvalidArgument(RenderJobFromJson(text, "f").status())) << text;
-  }
 }
 
 struct BadJob {
@@ -208,6 +189,63 @@ TEST(Convert, EveryJobFieldOutOfRangeIsRefused) {
       {"overrides.sky", [](auto& j) { j.mutable_overrides()->mutable_sky()->set_g(kNan); }},
       {"overrides.albedo", [](auto& j) { j.mutable_overrides()->mutable_albedo()->set_b(1.5f); }},
       {"overrides.albedo", [](auto& j) { j.mutable_overrides()->mutable_albedo()->set_b(-0.1f); }},
+      {"overrides.lights[0].kind",
+       [](auto& j) {
+         j.mutable_overrides()->mutable_lights(0)->set_kind(v1::LIGHT_KIND_UNSPECIFIED);
+       }},
+      {"overrides.lights[0].kind",
+       [](auto& j) {
+         j.mutable_overrides()->mutable_lights(0)->set_kind(static_cast<v1::LightKind>(9));
+       }},
+      {"overrides.lights[0].direction",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->clear_direction(); }},
+      {"overrides.lights[0].position",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->mutable_position()->set_x(kInf); }},
+      {"overrides.lights[0].intensity",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->mutable_intensity()->set_r(-1); }},
+      {"overrides.lights[0].range_m",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->set_range_m(-1); }},
+      {"overrides.lights[0].inner_cone_rad",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->set_inner_cone_rad(0.3); }},
+      {"overrides.lights[0].outer_cone_rad",
+       [](auto& j) { j.mutable_overrides()->mutable_lights(0)->set_outer_cone_rad(1.6); }},
+      {"overrides.lights",
+       [](auto& j) {
+         for (int i = 0; i < 65537; ++i) j.mutable_overrides()->add_lights();
+       }},
+      {"overrides.environment.uri",
+       [](auto& j) { j.mutable_overrides()->mutable_environment()->clear_uri(); }},
+      {"overrides.environment.scale",
+       [](auto& j) { j.mutable_overrides()->mutable_environment()->mutable_scale()->set_g(-1); }},
+      {"overrides.environment.rotation_deg",
+       [](auto& j) { j.mutable_overrides()->mutable_environment()->set_rotation_deg(kInf); }},
+      {"overrides.environment.up",
+       [](auto& j) { j.mutable_overrides()->mutable_environment()->mutable_up()->set_z(0); }},
+      {"overrides.materials[0].name",
+       [](auto& j) { j.mutable_overrides()->mutable_materials(0)->clear_name(); }},
+      {"overrides.materials[0].base_color",
+       [](auto& j) {
+         j.mutable_overrides()->mutable_materials(0)->mutable_base_color()->set_r(1.5f);
+       }},
+      {"overrides.materials[1].emission",
+       [](auto& j) {
+         j.mutable_overrides()->mutable_materials(1)->mutable_emission()->set_b(kNan);
+       }},
+      {"filter",
+       [](auto& j) { j.mutable_settings()->set_filter(static_cast<v1::PixelFilter>(99)); }},
+      {"settings", [](auto& j) { j.mutable_settings()->set_filter_width_px(17); }},
+      {"fps", [](auto& j) { j.set_fps(0); }},
+      {"fps", [](auto& j) { j.set_fps(1001); }},
+      {"fps", [](auto& j) { j.set_fps(kNan); }},
+      {"frames",
+       [](auto& j) {
+         for (int i = 0; i < 100'000; ++i) j.add_frames(i);
+       }},
+      {"after", [](auto& j) { j.add_after(""); }},
+      {"after",
+       [](auto& j) {
+         for (int i = 0; i < 64; ++i) j.add_after("x");
+       }},
       {"light_units", [](auto& j) { j.set_light_units(static_cast<v1::LightUnits>(99)); }},
       {"limits.max_pixels", [](auto& j) { j.mutable_limits()->set_max_pixels(0); }},
       {"limits.max_asset_bytes", [](auto& j) { j.mutable_limits()->set_max_asset_bytes(0); }},
@@ -240,6 +278,7 @@ TileWork FullWork() {
   work.frame.film = {.width = 640, .height = 480, .crop = {0, 0, 640, 480}};
   work.blobs = {DigestOf("s"), DigestOf("t"), DigestOf("r")};
   work.lease_time = std::chrono::milliseconds(1234);
+  work.frame_index = 6;
   return work;
 }
 
@@ -250,6 +289,7 @@ TEST(Convert, TileWorkSurvivesTheWire) {
   EXPECT_EQ(ToWire(*back).SerializeAsString(), wire.SerializeAsString());
   EXPECT_EQ(back->blobs, FullWork().blobs);
   EXPECT_EQ(back->rect, FullWork().rect);
+  EXPECT_EQ(back->frame_index, 6u);
 }
 
 TEST(Convert, EveryTileWorkFieldOutOfRangeIsRefused) {
@@ -325,20 +365,35 @@ TEST(Convert, JobStatusAndEventsSurviveTheWire) {
   status.priority = -3;
   status.progress = 0.5;
   status.submitted_unix_ms = 1234567890123;
+  status.frames = {.total = 4, .baked = 3, .done = 2};
+  status.after = {{"00000001"}, {"00000002"}};
   const absl::StatusOr<JobStatus> back = JobStatusFromWire(ToWire(status));
   ASSERT_TRUE(back.ok()) << back.status();
   EXPECT_EQ(ToWire(*back).SerializeAsString(), ToWire(status).SerializeAsString());
   EXPECT_EQ(back->error, status.error);
   EXPECT_EQ(back->tiles, status.tiles);
+  EXPECT_EQ(back->frames, status.frames);
+  EXPECT_EQ(back->after, status.after);
+  for (const JobState state : {JobState::kQueued, JobState::kBaking, JobState::kRendering,
+                               JobState::kDone, JobState::kCancelled, JobState::kPaused}) {
+    JobStatus other = status;
+    other.state = state;
+    EXPECT_EQ(JobStatusFromWire(ToWire(other))->state, state);
+  }
 
-  const JobEventBody bodies[] = {std::monostate(), JobState::kDone, TileCommitted{4, DigestOf("x")},
-                                 std::string("note")};
+  const JobEventBody bodies[] = {
+      std::monostate(), JobState::kDone, TileCommitted{4, DigestOf("x")}, std::string("note"),
+      LogLine{.level = LogLevel::kError, .text = "lost", .tile = 0, .attempt = 2, .worker = "w"}};
   for (const JobEventBody& body : bodies) {
-    const absl::StatusOr<JobEvent> event =
-        JobEventFromWire(ToWire(JobEvent{.sequence = 3, .body = body, .status = status}));
+    const absl::StatusOr<JobEvent> event = JobEventFromWire(
+        ToWire(JobEvent{.sequence = 3, .body = body, .status = status, .unix_ms = 1234567890123}));
     ASSERT_TRUE(event.ok()) << event.status();
     EXPECT_EQ(event->body.index(), body.index());
     EXPECT_EQ(event->sequence, 3u);
+    EXPECT_EQ(event->unix_ms, 1234567890123);
+    if (const auto* line = std::get_if<LogLine>(&body)) {
+      EXPECT_EQ(std::get<LogLine>(event->body), *line);
+    }
   }
 
   v1::JobStatus wire = ToWire(status);
@@ -356,6 +411,20 @@ TEST(Convert, JobStatusAndEventsSurviveTheWire) {
   wire = ToWire(status);
   wire.clear_id();
   EXPECT_TRUE(absl::IsInvalidArgument(JobStatusFromWire(wire).status()));
+  wire = ToWire(status);
+  wire.add_after(std::string(65, 'x'));
+  EXPECT_TRUE(absl::IsInvalidArgument(JobStatusFromWire(wire).status()));
+  v1::LogLine line = ToWire(LogLine{});
+  line.set_level(v1::LOG_LEVEL_UNSPECIFIED);
+  EXPECT_TRUE(absl::IsInvalidArgument(LogLineFromWire(line).status()));
+}
+
+TEST(Convert, ExplanationsSurviveTheWireAndAreBounded) {
+  const Explanation explanation{.lines = {"one", "two"}};
+  v1::ExplainResponse wire = ToWire(explanation);
+  EXPECT_EQ(ExplanationFromWire(wire)->lines, explanation.lines);
+  for (int i = 0; i < 10000; ++i) wire.add_lines("x");
+  EXPECT_TRUE(absl::IsInvalidArgument(ExplanationFromWire(wire).status()));
 }
 
 TEST(Convert, JobInfoSurvivesTheWireAndKeepsTilesInsideTheCrop) {

@@ -4,6 +4,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <functional>
 
 namespace farpoint {
 namespace {
@@ -30,6 +31,49 @@ TEST(Job, WhatIsMissingIsNamed) {
   job = SmallJob();
   job.asset_files.clear();
   EXPECT_THAT(std::string(ValidateJob(job).message()), HasSubstr("asset.files"));
+}
+
+TEST(Job, WrongSchedulesAndOverridesAreNamed) {
+  const struct {
+    const char* field;
+    std::function<void(JobSpec&)> spoil;
+  } cases[] = {
+      {"frames is 3 twice",
+       [](JobSpec& j) {
+         j.frames = {3, 4, 3};
+       }},
+      {"frames", [](JobSpec& j) { j.frames.assign(kMaxFrames + 1, 0); }},
+      {"fps", [](JobSpec& j) { j.fps = 0; }},
+      {"fps", [](JobSpec& j) { j.fps = NAN; }},
+      {"after", [](JobSpec& j) { j.after.assign(kMaxAfter + 1, {"x"}); }},
+      {"priority", [](JobSpec& j) { j.priority = 1001; }},
+      {"overrides.lights[0].direction",
+       [](JobSpec& j) {
+         j.overrides.lights = {{.kind = PunctualKind::kSpot, .direction = {0, 0, 2}}};
+       }},
+      {"overrides.lights[0].intensity",
+       [](JobSpec& j) {
+         j.overrides.lights = {{.intensity = {-1, 0, 0}}};
+       }},
+      {"overrides.lights[0].inner_cone_rad",
+       [](JobSpec& j) { j.overrides.lights = {{.inner_cone_rad = 0.5, .outer_cone_rad = 0.5}}; }},
+      {"overrides.environment.uri 'b.exr' is not among asset.files",
+       [](JobSpec& j) { j.overrides.environment = EnvironmentOverride{.uri = "b.exr"}; }},
+      {"overrides.environment.up",
+       [](JobSpec& j) {
+         j.overrides.environment = EnvironmentOverride{.uri = "a.gltf", .up = {0, 0, 0}};
+       }},
+      {"overrides.materials[0].base_color",
+       [](JobSpec& j) { j.overrides.materials = {{.name = "m", .base_color = Rgb(2, 0, 0)}}; }},
+      {"overrides.materials[0].name", [](JobSpec& j) { j.overrides.materials.resize(1); }},
+  };
+  for (const auto& c : cases) {
+    JobSpec job = SmallJob();
+    c.spoil(job);
+    const absl::Status status = ValidateJob(job);
+    EXPECT_TRUE(absl::IsInvalidArgument(status)) << c.field;
+    EXPECT_THAT(std::string(status.message()), HasSubstr(c.field));
+  }
 }
 
 TEST(Job, LimitsAreResourceExhausted) {
@@ -107,6 +151,98 @@ TEST(Job, OverridesReplaceLightSkyAndAlbedo) {
   for (const Material& m : scene.materials) EXPECT_EQ(m.base_color, Rgb(0.25f, 0.5f, 0.75f));
   EXPECT_FALSE(scene.materials[0].base_color_texture.present());
   EXPECT_TRUE(scene.materials[1].base_color_texture.present());  // its alpha is needed
+}
+
+TEST(Job, LightsAndSunsTogetherReplaceTheScenesLights) {
+  Scene scene;
+  scene.lights.resize(3);
+  SceneOverrides overrides;
+  overrides.lights = {{.name = "lamp", .kind = PunctualKind::kPoint, .position = {1, 2, 3}}};
+  ASSERT_TRUE(ApplyOverrides(overrides, {}, scene).ok());
+  ASSERT_EQ(scene.lights.size(), 1u);
+  EXPECT_EQ(scene.lights[0].position, Vec3d(1, 2, 3));
+  overrides.suns = {{.to_sun = {0, 1, 0}, .irradiance = {1, 1, 1}}};
+  ASSERT_TRUE(ApplyOverrides(overrides, {}, scene).ok());
+  ASSERT_EQ(scene.lights.size(), 2u);
+  EXPECT_EQ(scene.lights[0].kind, PunctualKind::kDirectional);
+  EXPECT_EQ(scene.lights[1].name, "lamp");
+}
+
+TEST(Job, AnEnvironmentReplacesSkyAndMap) {
+  // A Radiance picture of 2x1 texels of radiance 1: 2^(129 - 128) * 128 / 256.
+  std::string picture = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 2\n";
+  for (int i = 0; i < 2; ++i) picture += "\x80\x80\x80\x81";
+  AssetBundle asset;
+  asset.files["env/sky.hdr"] = Blob::FromString(picture);
+  Scene scene;
+  scene.environment.sky = Rgb(9, 9, 9);
+  SceneOverrides overrides;
+  overrides.environment = EnvironmentOverride{
+      .uri = "env/sky.hdr", .scale = {2, 3, 4}, .rotation_deg = 90, .up = {0, 1, 0}};
+  ASSERT_TRUE(ApplyOverrides(overrides, asset, scene).ok());
+  EXPECT_EQ(scene.environment.sky, Rgb(0, 0, 0));
+  ASSERT_EQ(scene.environment.map.size(), 2u);
+  EXPECT_EQ(scene.environment.map[1], Rgb(2, 3, 4));
+  // Counter-clockwise seen from above: the map's +z turns to +x.
+  EXPECT_NEAR(scene.environment.world_from_map[2].x, 1, 1e-12);
+  overrides.sky = Rgb(5, 5, 5);
+  ASSERT_TRUE(ApplyOverrides(overrides, asset, scene).ok());
+  EXPECT_EQ(scene.environment.sky, Rgb(5, 5, 5));
+  EXPECT_EQ(scene.environment.map.size(), 2u);
+
+  overrides.environment->uri = "env/other.hdr";
+  const absl::Status missing = ApplyOverrides(overrides, asset, scene);
+  EXPECT_TRUE(absl::IsNotFound(missing));
+  EXPECT_THAT(std::string(missing.message()), HasSubstr("env/other.hdr"));
+  asset.files["env/other.hdr"] = Blob::FromString("no picture");
+  EXPECT_FALSE(ApplyOverrides(overrides, asset, scene).ok());
+}
+
+TEST(Job, MaterialsAreReplacedByTheirName) {
+  Scene scene;
+  scene.materials.resize(4);
+  scene.materials[0].name = scene.materials[1].name = "wall";
+  scene.materials[2].name = "lamp";
+  scene.materials[3].name = "leaf";
+  for (Material& material : scene.materials) {
+    material.base_color_texture.texture = material.emission_texture.texture = 0;
+  }
+  scene.materials[3].alpha_mode = AlphaMode::kMask;
+  SceneOverrides overrides;
+  overrides.albedo = Rgb(0.5f, 0.5f, 0.5f);
+  overrides.materials = {{.name = "wall", .base_color = Rgb(0.1f, 0.2f, 0.3f)},
+                         {.name = "lamp", .emission = Rgb(7, 8, 9)},
+                         {.name = "leaf", .base_color = Rgb(0, 1, 0)}};
+  ASSERT_TRUE(ApplyOverrides(overrides, {}, scene).ok());
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_EQ(scene.materials[i].base_color, Rgb(0.1f, 0.2f, 0.3f));
+    EXPECT_FALSE(scene.materials[i].base_color_texture.present());
+    EXPECT_TRUE(scene.materials[i].emission_texture.present());
+  }
+  EXPECT_EQ(scene.materials[2].emission, Rgb(7, 8, 9));
+  EXPECT_FALSE(scene.materials[2].emission_texture.present());
+  EXPECT_EQ(scene.materials[2].base_color, Rgb(0.5f, 0.5f, 0.5f));
+  EXPECT_TRUE(scene.materials[3].base_color_texture.present());  // its alpha is needed
+
+  overrides.materials = {{.name = "wal"}};
+  const absl::Status unknown = ApplyOverrides(overrides, {}, scene);
+  EXPECT_TRUE(absl::IsNotFound(unknown));
+  EXPECT_THAT(std::string(unknown.message()), HasSubstr("'wal'; the nearest are 'wall'"));
+  Scene bare;
+  EXPECT_THAT(std::string(ApplyOverrides(overrides, {}, bare).message()), HasSubstr("it has none"));
+}
+
+TEST(Job, FramesHaveNumbersAndTimes) {
+  JobSpec job;
+  EXPECT_EQ(job.frame_count(), 1u);
+  EXPECT_EQ(job.frame_number(0), 0);
+  EXPECT_FALSE(job.frame_time_s(0).has_value());
+  job.frames = {12, -6};
+  job.fps = 12;
+  EXPECT_EQ(job.frame_count(), 2u);
+  EXPECT_EQ(job.frame_number(1), -6);
+  EXPECT_EQ(job.frame_time_s(0), 1.0);
+  EXPECT_EQ(job.frame_time_s(1), -0.5);
 }
 
 TEST(Job, NoOverrideChangesNothing) {

@@ -106,13 +106,16 @@ class FakeFrame final : public RenderedFrame {
 
 class FakeScene final : public RenderedScene {
  public:
-  explicit FakeScene(FakeFrame::Hook hook) : hook_(std::move(hook)) {}
+  FakeScene(FakeFrame::Hook hook, std::atomic<int>& frames)
+      : hook_(std::move(hook)), frames_(frames) {}
   absl::StatusOr<std::unique_ptr<RenderedFrame>> StartFrame(const FrameSpec& frame) const override {
+    ++frames_;
     return std::make_unique<FakeFrame>(frame, hook_);
   }
 
  private:
   FakeFrame::Hook hook_;
+  std::atomic<int>& frames_;
 };
 
 class FakeRenderer final : public TileRenderer {
@@ -122,9 +125,10 @@ class FakeRenderer final : public TileRenderer {
   absl::StatusOr<std::shared_ptr<const RenderedScene>> LoadScene(const BakedScene&,
                                                                  Executor&) const override {
     ++loads;
-    return std::make_shared<const FakeScene>(hook_);
+    return std::make_shared<const FakeScene>(hook_, frames);
   }
   mutable std::atomic<int> loads = 0;
+  mutable std::atomic<int> frames = 0;
 
  private:
   FakeFrame::Hook hook_;

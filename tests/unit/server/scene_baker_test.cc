@@ -93,6 +93,38 @@ TEST(CoreBaker, BakesAnAssetAndStopsWhenTold) {
   EXPECT_TRUE(absl::IsCancelled(baker->Bake(*asset, spec, std::nullopt, cancel).status()));
 }
 
+TEST(CoreBaker, BakesAgainOnlyWhatChanged) {
+  TempFolder folder;
+  ASSERT_TRUE(WriteGltf(MakeCornellBox(), folder / "cornell.gltf").ok());
+  const auto asset = CollectAsset(folder / "cornell.gltf");
+  ASSERT_TRUE(asset.ok()) << asset.status();
+  const auto warm = MakeCoreBaker(2), forgetful = MakeCoreBaker(1, 0);
+  const std::atomic<bool> cancel = false;
+  JobSpec spec = SmallJob();
+  spec.settings.light_samples = 2;
+  const auto bake = [&](SceneBaker& baker) {
+    auto result = baker.Bake(*asset, spec, std::nullopt, cancel);
+    EXPECT_TRUE(result.ok()) << result.status();
+    return *std::move(result);
+  };
+  const auto skipped = [](const BakeResult& result, const char* key) -> uint64_t {
+    const auto it = result.stats.skipped.find(key);
+    return it == result.stats.skipped.end() ? 0 : it->second;
+  };
+  const BakeResult first = bake(*warm);
+  EXPECT_EQ(skipped(first, "bake_stages"), 0u);
+  const BakeResult again = bake(*warm);
+  EXPECT_EQ(skipped(again, "bake_stages"), 3u);
+  spec.overrides.suns = {{{0, 0.1, -1}, {1, 1, 1}}};
+  const BakeResult sun = bake(*warm), cold = bake(*forgetful);
+  EXPECT_EQ(skipped(sun, "bake_stages"), 2u);
+  EXPECT_EQ(skipped(cold, "bake_stages"), 0u);
+  EXPECT_EQ(sun.blobs.tree_topology.Hash(), first.blobs.tree_topology.Hash());
+  EXPECT_EQ(sun.blobs.tree_topology.Hash(), cold.blobs.tree_topology.Hash());
+  EXPECT_EQ(sun.blobs.tree_radiance.Hash(), cold.blobs.tree_radiance.Hash());
+  EXPECT_NE(sun.blobs.tree_radiance.Hash(), first.blobs.tree_radiance.Hash());
+}
+
 TEST(CoreBaker, ABrokenAssetIsThePersonsErrorNotOurs) {
   AssetBundle asset;
   asset.root = "a.gltf";

@@ -57,12 +57,15 @@ class FakeStreamer final : public BlobStreamer {
 class BlobCacheTest : public ::testing::Test {
  protected:
   std::unique_ptr<BlobCache> Open(uint64_t max_bytes = 1 << 20, uint64_t max_blob = 1 << 20) {
-    auto cache = BlobCache::Open({folder_.path(), max_bytes, max_blob}, streamer_);
+    auto cache = BlobCache::Open({folder_.path(), max_bytes, max_blob,
+                                  [this](const std::string& text) { warnings_.push_back(text); }},
+                                 streamer_);
     EXPECT_TRUE(cache.ok()) << cache.status();
     return *std::move(cache);
   }
   TempFolder folder_;
   FakeStreamer streamer_;
+  std::vector<std::string> warnings_;
   const std::string content_ = std::string(95, 'a') + "the end";
 };
 
@@ -106,9 +109,12 @@ TEST_F(BlobCacheTest, APartThatIsTooLongIsThrownAway) {
 TEST_F(BlobCacheTest, ADamagedFileIsFetchedAgain) {
   const Digest digest = streamer_.Add(content_);
   ASSERT_TRUE(Open()->Get(digest, {}).ok());
+  EXPECT_TRUE(warnings_.empty());
   std::ofstream(folder_ / digest.Hex()) << std::string(content_.size(), 'x');
   EXPECT_EQ(TextOf(*Open()->Get(digest, {})), content_);
   EXPECT_EQ(streamer_.offsets.size(), 2u);
+  ASSERT_EQ(warnings_.size(), 1u);
+  EXPECT_NE(warnings_[0].find(digest.Hex() + "' was damaged"), std::string::npos);
 }
 
 TEST_F(BlobCacheTest, WrongContentsAreRefused) {

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <atomic>
 #include <condition_variable>
 #include <deque>
 #include <mutex>
@@ -10,6 +11,8 @@
 #include "core/image/film.h"
 #include "server/coordinator.h"
 #include "tests/unit/server/fake_render.h"
+#include "tests/unit/server/temp_folder.h"
+#include "worker/blob_cache.h"
 #include "worker/in_process_link.h"
 
 namespace farpoint {
@@ -332,6 +335,77 @@ TEST(InProcess, TwoWorkersRenderAJob) {
     EXPECT_TRUE(e->status.ok());
   }
   EXPECT_EQ(ImageHash(image), ImageHash(FakeTile(spec.film.crop, spec.settings.layers)));
+}
+
+// A coordinator's blobs as a worker on another machine gets them.
+class CountingStreamer final : public BlobStreamer {
+ public:
+  explicit CountingStreamer(CoordinatorApi& api) : api_(api) {}
+  absl::Status Stream(const Digest& digest, uint64_t offset, const Sink& sink) override {
+    ++streams;
+    FP_ASSIGN_OR_RETURN(const Blob blob, api_.GetBlob(digest));
+    return sink(blob.size(), blob.bytes().subspan(offset));
+  }
+  std::atomic<int> streams = 0;
+
+ private:
+  CoordinatorApi& api_;
+};
+
+TEST(InProcess, ASecondJobOfASceneSendsNoBlob) {
+  CoordinatorOptions options;
+  const auto baker = std::make_shared<FakeBaker>();
+  options.baker = baker;
+  auto coordinator = Coordinator::Open(std::move(options));
+  ASSERT_TRUE(coordinator.ok()) << coordinator.status();
+  TempFolder folder;
+  CountingStreamer streamer(**coordinator);
+  auto cache = BlobCache::Open({.directory = folder.path()}, streamer);
+  ASSERT_TRUE(cache.ok()) << cache.status();
+  const FakeRenderer renderer;
+
+  const Blob blob = Blob::FromString("scene");
+  const std::vector<Digest> files = {blob.Hash()};
+  int puts = 0;
+  // Submits as a client does, renders by a worker that has started afresh.
+  const auto render = [&](const JobSpec& spec) {
+    const std::vector<Digest> missing = *(*coordinator)->FindMissing(files);
+    for (const Digest& digest : missing) {
+      ++puts;
+      ASSERT_TRUE((*coordinator)->PutBlob(digest, blob).ok());
+    }
+    const auto job = (*coordinator)->Submit(spec, "");
+    ASSERT_TRUE(job.ok()) << job.status();
+    InProcessLink<CoordinatorApi> link(**coordinator);
+    Worker worker({.threads = 1, .fingerprint = Sha256().Update("f").Finish()}, link, **cache,
+                  renderer);
+    std::thread thread([&] { EXPECT_TRUE(worker.Run().ok()); });
+    uint64_t after = 0;
+    for (int i = 0; i < 200 && (*coordinator)->Status(*job)->state != JobState::kDone; ++i) {
+      const auto events = (*coordinator)->NextEvents(*job, after, milliseconds(100));
+      if (!events->empty()) after = std::max(after, events->back().sequence);
+    }
+    EXPECT_EQ((*coordinator)->Status(*job)->state, JobState::kDone);
+    worker.Stop();
+    thread.join();
+  };
+  JobSpec spec;
+  spec.asset_root = "a.gltf";
+  spec.asset_files["a.gltf"] = blob.Hash();
+  spec.film = {.width = 64, .height = 32, .crop = {0, 0, 64, 32}};
+  spec.settings.tile_px = 32;
+  spec.settings.layers = {Layer::kBeauty};
+  ASSERT_NO_FATAL_FAILURE(render(spec));
+  EXPECT_EQ(puts, 1);
+  EXPECT_EQ(streamer.streams.load(), 2);  // the scene and the topology; the fake bakes no radiance
+  // Another camera and other frames of a scene that stands still: not one byte of it.
+  spec.camera = LookAt{.eye = {0, 0, 5}, .target = {0, 0, 0}};
+  ASSERT_NO_FATAL_FAILURE(render(spec));
+  spec.frames = {1, 2, 3};
+  ASSERT_NO_FATAL_FAILURE(render(spec));
+  EXPECT_EQ(puts, 1);
+  EXPECT_EQ(streamer.streams.load(), 2);
+  EXPECT_EQ(baker->bakes.load(), 1);
 }
 
 }  // namespace
