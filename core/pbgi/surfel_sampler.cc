@@ -85,14 +85,22 @@ struct Lattice {
   Vec3f origin;
   float inverse_cell;
 
-  Cell CellOf(const Vec3f& p) const {
-    const auto cell = [this](float v, float o) {
-      // Far within the range of int64_t, whatever the shape.
-      const float c = std::clamp((v - o) * inverse_cell, -0x1p50f, 0x1p50f);
-      return static_cast<int64_t>(std::floor(c));
-    };
-    return {cell(p.x, origin.x), cell(p.y, origin.y), cell(p.z, origin.z)};
+  // Position in cells; clamped to what fits int64_t with room, whatever the shape.
+  Vec3f InCells(const Vec3f& p) const {
+    const Vec3f c = (p - origin) * inverse_cell;
+    return Max(Min(c, Vec3f(0x1p50f)), Vec3f(-0x1p50f));
   }
+  static Cell CellOf(const Vec3f& in_cells) {
+    return {static_cast<int64_t>(std::floor(in_cells.x)),
+            static_cast<int64_t>(std::floor(in_cells.y)),
+            static_cast<int64_t>(std::floor(in_cells.z))};
+  }
+};
+
+// A point of a cube's grid.
+struct GridPlace {
+  int x, y, z;    // its cell
+  Vec3f in_cell;  // where within it, in cells
 };
 
 struct Accepted {
@@ -109,9 +117,11 @@ constexpr std::array<std::array<int8_t, 2>, 9> kRows = {
 // The surfels in and around one cube.
 class CubeGrid {
  public:
-  void Clear() {
+  // Cells are `cell` wide.
+  void Clear(float cell) {
     rows_.fill(0);
     samples_.clear();
+    cell2_ = cell * cell;
   }
   // x, y, z in [0, kGridSide).
   void Insert(int x, int y, int z, const Vec3f& p, const Vec3f& n, uint32_t* share) {
@@ -122,45 +132,28 @@ class CubeGrid {
     row |= bit;
     head = static_cast<uint32_t>(samples_.size() - 1);
   }
-  // Whether a surfel of the same side lies within less than sqrt(distance2). x, y, z in
-  // [1, kGridSide - 1), the cell of p.
-  bool AnyWithin(int x, int y, int z, const Vec3f& p, const Vec3f& n, float distance2) const {
-    for (const auto& [dz, dy] : kRows) {
-      const int row_index = (z + dz) * kGridSide + y + dy;
-      uint32_t cells = (rows_[static_cast<size_t>(row_index)] >> (x - 1)) & 7u;
-      for (; cells != 0; cells &= cells - 1) {
-        const int cx = x - 1 + std::countr_zero(cells);
-        for (uint32_t i = heads_[static_cast<size_t>(row_index * kGridSide + cx)]; i != kNone;
-             i = samples_[i].next) {
-          const Sample& s = samples_[i];
-          if (Length2(s.position - p) < distance2 && Dot(s.normal, n) > kSameSurfaceCosine) {
-            return true;
-          }
-        }
-      }
-    }
-    return false;
+  // Whether a surfel of the same side lies within less than a cell's width of p at `place`, whose
+  // coordinates are in [1, kGridSide - 1).
+  bool AnyWithinOneCell(const GridPlace& place, const Vec3f& p, const Vec3f& n) const {
+    const float distance2 = cell2_;
+    return ForNear(place, distance2, [&](const Sample& s, float&) {
+      return Length2(s.position - p) < distance2 && Dot(s.normal, n) > kSameSurfaceCosine;
+    });
   }
-  // The share of the nearest surfel of the same side in the 27 cells around; null if there is none.
-  uint32_t* Nearest(int x, int y, int z, const Vec3f& p, const Vec3f& n) const {
-    float best = std::numeric_limits<float>::infinity();
+  // The share of the nearest surfel of the same side, if there is one within a cell's width; null
+  // or any that is farther away if not.
+  uint32_t* Nearest(const GridPlace& place, const Vec3f& p, const Vec3f& n) const {
     uint32_t* share = nullptr;
-    for (const auto& [dz, dy] : kRows) {
-      const int row_index = (z + dz) * kGridSide + y + dy;
-      uint32_t cells = (rows_[static_cast<size_t>(row_index)] >> (x - 1)) & 7u;
-      for (; cells != 0; cells &= cells - 1) {
-        const int cx = x - 1 + std::countr_zero(cells);
-        for (uint32_t i = heads_[static_cast<size_t>(row_index * kGridSide + cx)]; i != kNone;
-             i = samples_[i].next) {
-          const Sample& s = samples_[i];
-          const float d2 = Length2(s.position - p);
-          if (d2 < best && Dot(s.normal, n) > kSameSurfaceCosine) {
-            best = d2;
-            share = s.share;
-          }
-        }
+    float nearest2 = std::numeric_limits<float>::infinity();
+    ForNear(place, cell2_, [&](const Sample& s, float& reach2) {
+      const float d2 = Length2(s.position - p);
+      if (d2 < nearest2 && Dot(s.normal, n) > kSameSurfaceCosine) {
+        nearest2 = d2;
+        reach2 = std::min(reach2, d2);
+        share = s.share;
       }
-    }
+      return false;
+    });
     return share;
   }
 
@@ -170,9 +163,40 @@ class CubeGrid {
     uint32_t next;
     uint32_t* share;
   };
+
+  // Calls visit(sample, reach2) for those in the 27 cells around, but for cells that are farther
+  // away than sqrt(reach2), which visit may lower; until it returns true.
+  template <typename Visit>
+  bool ForNear(const GridPlace& place, float reach2, Visit&& visit) const {
+    // Squared distances to the layers of cells before (0), at (1) and behind (2) the place's own,
+    // rounded down far enough.
+    const float scale = cell2_ * 0.9999f;
+    const auto layers = [scale](float f) {
+      return std::array<float, 3>{f * f * scale, 0.0f, (1.0f - f) * (1.0f - f) * scale};
+    };
+    const auto lx = layers(place.in_cell.x), ly = layers(place.in_cell.y),
+               lz = layers(place.in_cell.z);
+    for (const auto& [dz, dy] : kRows) {
+      const float row2 = ly[static_cast<size_t>(dy + 1)] + lz[static_cast<size_t>(dz + 1)];
+      if (row2 > reach2) continue;
+      const int row = (place.z + dz) * kGridSide + place.y + dy;
+      uint32_t cells = (rows_[static_cast<size_t>(row)] >> (place.x - 1)) & 7u;
+      for (; cells != 0; cells &= cells - 1) {
+        const int dx = std::countr_zero(cells);
+        if (row2 + lx[static_cast<size_t>(dx)] > reach2) continue;
+        for (uint32_t i = heads_[static_cast<size_t>(row * kGridSide + place.x - 1 + dx)];
+             i != kNone; i = samples_[i].next) {
+          if (visit(samples_[i], reach2)) return true;
+        }
+      }
+    }
+    return false;
+  }
+
   std::array<uint32_t, kGridSide * kGridSide> rows_;  // which cells hold anything
   std::array<uint32_t, kGridSide * kGridSide * kGridSide> heads_;
   std::vector<Sample> samples_;
+  float cell2_ = 0;
 };
 
 }  // namespace
@@ -291,7 +315,7 @@ struct ObjectSampler::Impl {
       const auto index = static_cast<uint32_t>(out.leaves.size());
       const size_t first_visit = out.visits.size();
       ForCandidates(leaf, [&](uint32_t, const Vec2f&, const Vec3f& p) {
-        const uint64_t cube = lattice.CellOf(p).Cube();
+        const uint64_t cube = Lattice::CellOf(lattice.InCells(p)).Cube();
         for (size_t i = out.visits.size(); i-- > first_visit;) {
           if (out.visits[i].key == cube) return;
         }
@@ -417,9 +441,13 @@ ObjectSurfels ObjectSampler::Sample() {
   });
 
   // What one thread needs for a cube.
+  struct Candidate {
+    Accepted surfel;
+    GridPlace place;
+  };
   struct Scratch {
     CubeGrid grid;
-    std::vector<Accepted> candidates;
+    std::vector<Candidate> candidates;
     std::vector<uint32_t> order;
   };
   static thread_local std::unique_ptr<Scratch> scratch_of_thread;
@@ -441,7 +469,7 @@ ObjectSurfels ObjectSampler::Sample() {
     }
   };
   const auto load_surfels = [&](size_t cube, const GridOrigin& origin, bool own, CubeGrid& grid) {
-    grid.Clear();
+    grid.Clear(impl.spacing);
     for (int dz = -1; dz <= 1; ++dz) {
       for (int dy = -1; dy <= 1; ++dy) {
         for (int dx = -1; dx <= 1; ++dx) {
@@ -449,7 +477,7 @@ ObjectSurfels ObjectSampler::Sample() {
           const uint32_t at = table[slot_of(NeighbourCube(cubes[cube].code, dx, dy, dz))];
           if (at == kNone) continue;
           for (Accepted& a : cubes[at].accepted) {
-            const auto [x, y, z] = origin.Place(impl.lattice.CellOf(a.position));
+            const auto [x, y, z] = origin.Place(Lattice::CellOf(impl.lattice.InCells(a.position)));
             if (x >= kGridSide || y >= kGridSide || z >= kGridSide) continue;
             grid.Insert(static_cast<int>(x), static_cast<int>(y), static_cast<int>(z), a.position,
                         normals[a.triangle], &a.share);
@@ -463,15 +491,22 @@ ObjectSurfels ObjectSampler::Sample() {
     for (size_t v = cube.first_visit; v < cube.end_visit; ++v) {
       const Leaf& leaf = impl.leaves[impl.visits[v].index];
       impl.ForCandidates(leaf, [&](uint32_t, const Vec2f& b, const Vec3f& p) {
-        const auto [x, y, z] = origin.Place(impl.lattice.CellOf(p));
+        const Vec3f in_cells = impl.lattice.InCells(p);
+        const Cell cell = Lattice::CellOf(in_cells);
+        const auto [x, y, z] = origin.Place(cell);
         const auto inside = [](int64_t c) { return c >= 1 && c < kGridSide - 1; };
         if (!inside(x) || !inside(y) || !inside(z)) return;
-        visit(static_cast<int>(x), static_cast<int>(y), static_cast<int>(z), leaf.triangle, b, p);
+        const GridPlace place{
+            static_cast<int>(x),
+            static_cast<int>(y),
+            static_cast<int>(z),
+            {in_cells.x - static_cast<float>(cell.x), in_cells.y - static_cast<float>(cell.y),
+             in_cells.z - static_cast<float>(cell.z)}};
+        visit(place, leaf.triangle, b, p);
       });
     }
   };
 
-  const float spacing2 = impl.spacing * impl.spacing;
   std::array<std::vector<uint32_t>, kPhases> phases;
   for (size_t i = 0; i < cubes.size(); ++i) {
     phases[cubes[i].code % kPhases].push_back(static_cast<uint32_t>(i));
@@ -482,10 +517,11 @@ ObjectSurfels ObjectSampler::Sample() {
       Cube& cube = cubes[phase[i]];
       const GridOrigin origin(cube.code);
       s.candidates.clear();
-      for_candidates(cube, origin,
-                     [&](int, int, int, uint32_t triangle, const Vec2f& b, const Vec3f& p) {
-                       s.candidates.push_back({p, triangle, b, 0});
-                     });
+      for_candidates(
+          cube, origin,
+          [&](const GridPlace& place, uint32_t triangle, const Vec2f& b, const Vec3f& p) {
+            s.candidates.push_back({{p, triangle, b, 0}, place});
+          });
       load_surfels(phase[i], origin, false, s.grid);
       // A random order (Fisher and Yates), drawn as it is needed.
       const auto n = static_cast<uint32_t>(s.candidates.size());
@@ -497,13 +533,11 @@ ObjectSurfels ObjectSampler::Sample() {
         const auto j =
             k + static_cast<uint32_t>(((random >> 32) * static_cast<uint64_t>(n - k)) >> 32);
         std::swap(s.order[k], s.order[j]);
-        const Accepted& c = s.candidates[s.order[k]];
-        const auto [x64, y64, z64] = origin.Place(impl.lattice.CellOf(c.position));
-        const int x = static_cast<int>(x64), y = static_cast<int>(y64), z = static_cast<int>(z64);
-        const Vec3f& normal = normals[c.triangle];
-        if (s.grid.AnyWithin(x, y, z, c.position, normal, spacing2)) continue;
-        s.grid.Insert(x, y, z, c.position, normal, nullptr);
-        cube.accepted.push_back(c);
+        const Candidate& c = s.candidates[s.order[k]];
+        const Vec3f& normal = normals[c.surfel.triangle];
+        if (s.grid.AnyWithinOneCell(c.place, c.surfel.position, normal)) continue;
+        s.grid.Insert(c.place.x, c.place.y, c.place.z, c.surfel.position, normal, nullptr);
+        cube.accepted.push_back(c.surfel);
       }
     });
   }
@@ -515,9 +549,9 @@ ObjectSurfels ObjectSampler::Sample() {
     const GridOrigin origin(cubes[i].code);
     load_surfels(i, origin, true, s.grid);
     for_candidates(cubes[i], origin,
-                   [&](int x, int y, int z, uint32_t triangle, const Vec2f&, const Vec3f& p) {
+                   [&](const GridPlace& place, uint32_t triangle, const Vec2f&, const Vec3f& p) {
                      // A surfel is its own nearest, and who was refused has one within a spacing.
-                     if (uint32_t* share = s.grid.Nearest(x, y, z, p, normals[triangle])) {
+                     if (uint32_t* share = s.grid.Nearest(place, p, normals[triangle])) {
                        std::atomic_ref<uint32_t>(*share).fetch_add(1, std::memory_order_relaxed);
                      }
                    });

@@ -1,6 +1,7 @@
 #include "core/pbgi/surfel_shader.h"
 
 #include <algorithm>
+#include <array>
 
 #include "core/base/check.h"
 #include "core/math/elementary.h"
@@ -25,14 +26,29 @@ uint64_t KeyOf(const SurfelCloud& cloud, size_t i, const PreparedScene& scene, u
                  static_cast<uint64_t>(cloud.barycentric[i].x * 16777216.0f));
 }
 
+// Sets of kInteriorRays directions about +z, stratified by the cosine. Drawing from a table costs
+// nothing beside the ray.
+constexpr size_t kInteriorSets = 256;
+using InteriorSet = std::array<Vec3f, kInteriorRays>;
+
+std::array<InteriorSet, kInteriorSets> MakeInteriorSets() {
+  std::array<InteriorSet, kInteriorSets> sets;
+  for (size_t set = 0; set < kInteriorSets; ++set) {
+    const auto seed = static_cast<uint32_t>(HashKey(set));
+    for (uint32_t i = 0; i < kInteriorRays; ++i) {
+      sets[set][i] = CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed));
+    }
+  }
+  return sets;
+}
+
 // Whether all rays that leave `p` on the side of `ng` hit surfaces from behind.
-bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, uint64_t key,
-                       PieceCounts& counts) {
+bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng,
+                       const InteriorSet& set, PieceCounts& counts) {
   const Frame frame(ng);
   const Vec3f origin = accel.LeaveSurface(p, ng);
-  const uint32_t seed = static_cast<uint32_t>(key);
-  for (uint32_t i = 0; i < kInteriorRays; ++i) {
-    const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
+  for (const Vec3f& local : set) {
+    const Vec3f w = frame.ToWorld(local);
     ++counts.interior;
     const std::optional<RayHit> hit = accel.Intersect(origin, w);
     if (!hit || Dot(accel.scene().GeometricNormal(hit->triangle), w) < 0.0f) return false;
@@ -44,6 +60,7 @@ bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng, u
 
 SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint64_t seed,
                           Executor& executor, Stats& stats) {
+  static const std::array<InteriorSet, kInteriorSets> sets = MakeInteriorSets();
   const size_t n = cloud.size();
   SurfelSides sides(n);
   std::vector<PieceCounts> piece_counts((n + kPiece - 1) / kPiece);
@@ -54,8 +71,8 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
       uint8_t open = 0;
       for (unsigned side = 0; side < 2; ++side) {
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
-        if (!SeesOnlyBackFaces(accel, cloud.position[i], ng, HashKey(HashKey(key, side), 5),
-                               counts)) {
+        const InteriorSet& set = sets[HashKey(key, side, 5) % kInteriorSets];
+        if (!SeesOnlyBackFaces(accel, cloud.position[i], ng, set, counts)) {
           open |= side == 0 ? kFrontVisible : kBackVisible;
         }
       }
