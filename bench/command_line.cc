@@ -50,7 +50,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   if (!args.empty() &&
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
     return absl::UnimplementedError("'" + args.front() +
-                                    "' is not built yet; use pareto, rebake or micro");
+                                    "' is not built yet; use pareto, rebake, lights or micro");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -125,6 +125,21 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(uint64_t{0}, uint64_t{1} << 24));
 
+  LightsOptions& l = line.lights;
+  CLI::App* lights = app.add_subcommand(
+      "lights", "Direct light: time and error by number and kind of lights; writes lights.json");
+  AddCommonOptions(*lights, line.output_dir, l.quick);
+  lights->add_option("--light-samples", l.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  lights->add_option("--receivers", l.receivers, "Points at which light is measured")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 1'000'000));
+  lights->add_option("--reference-samples", l.reference_samples, "Shadow rays of the reference")
+      ->capture_default_str()
+      ->check(CLI::Range(1u, 1u << 24));
+  lights->add_option("--seed", l.seed, "Of every random choice")->capture_default_str();
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -133,6 +148,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
     const CLI::App* asked = pareto->parsed()   ? pareto
                             : micro->parsed()  ? micro
                             : rebake->parsed() ? rebake
+                            : lights->parsed() ? lights
                                                : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -144,6 +160,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   }
   line.verb = pareto->parsed()   ? BenchVerb::kPareto
               : rebake->parsed() ? BenchVerb::kRebake
+              : lights->parsed() ? BenchVerb::kLights
                                  : BenchVerb::kMicro;
   r.cache_bytes = cache_mib << 20;
   if (!sun.empty()) {

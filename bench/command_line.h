@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "bench/lights.h"
 #include "bench/micro.h"
 #include "bench/pareto.h"
 #include "bench/rebake.h"
@@ -12,7 +13,7 @@
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -20,6 +21,7 @@ struct BenchCommandLine {
   std::string output_dir;
   ParetoOptions pareto;
   RebakeOptions rebake;
+  LightsOptions lights;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

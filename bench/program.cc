@@ -53,6 +53,16 @@ absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostrea
   return absl::OkStatus();
 }
 
+absl::Status Lights(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  FP_ASSIGN_OR_RETURN(const LightsReport report, RunLights(line.lights, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  const std::filesystem::path path = std::filesystem::path(line.output_dir) / "lights.json";
+  FP_RETURN_IF_ERROR(WriteText(path, LightsJson(report)));
+  out << LightsTable(report) << "\n" << path.string() << "\n";
+  return absl::OkStatus();
+}
+
 absl::Status Micro(const BenchCommandLine& line, std::ostream& out) {
   MicroOptions options = line.micro;
   options.json_path = (std::filesystem::path(line.output_dir) / "micro.json").string();
@@ -73,6 +83,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Pareto(line, out, err);
     case BenchVerb::kRebake:
       return Rebake(line, out, err);
+    case BenchVerb::kLights:
+      return Lights(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }

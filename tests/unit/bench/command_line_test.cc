@@ -87,6 +87,19 @@ TEST(BenchCommandLine, RebakeTakesAll) {
   EXPECT_THAT(MessageOf({"rebake", "--sky", "1,2"}), HasSubstr("--sky"));
 }
 
+TEST(BenchCommandLine, LightsTakesAll) {
+  const auto line = ParseBenchCommandLine({"lights", "--light-samples", "9", "--receivers", "7",
+                                           "--reference-samples", "99", "--seed", "3", "--quick"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  EXPECT_EQ(line->verb, BenchVerb::kLights);
+  EXPECT_EQ(line->lights.light_samples, 9u);
+  EXPECT_EQ(line->lights.receivers, 7u);
+  EXPECT_EQ(line->lights.reference_samples, 99u);
+  EXPECT_EQ(line->lights.seed, 3u);
+  EXPECT_TRUE(line->lights.quick);
+  EXPECT_THAT(MessageOf({"lights", "--receivers", "0"}), HasSubstr("--receivers"));
+}
+
 TEST(BenchCommandLine, PlannedBenchmarksAreRefusedPlainly) {
   for (const char* name : {"paper", "scale", "stability", "skip", "service"}) {
     const auto line = ParseBenchCommandLine({name, "--quick"});
@@ -101,6 +114,7 @@ TEST(BenchCommandLine, HelpListsWhatWorksOnly) {
   EXPECT_THAT(*line->print, HasSubstr("  pareto "));
   EXPECT_THAT(*line->print, HasSubstr("  micro "));
   EXPECT_THAT(*line->print, HasSubstr("  rebake "));
+  EXPECT_THAT(*line->print, HasSubstr("  lights "));
   for (const char* name : {"  paper", "  scale", "  stability", "  skip", "  service"}) {
     EXPECT_THAT(*line->print, Not(HasSubstr(name)));
   }

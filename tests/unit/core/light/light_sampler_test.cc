@@ -532,7 +532,9 @@ TEST(ManyLights, PunctualOnesAreDrawnWithoutBias) {
       EXPECT_LE(counters.rays + counters.skipped_facing_away, samples);
       const Estimate e = OverKeys(lit, p, kUp, 2000, samples);
       EXPECT_NEAR(e.mean(), expected, 4 * e.standard_error() + 1e-5 * expected) << i;
-      if (samples == 32) EXPECT_LT(std::sqrt(e.variance()), 0.2 * expected);
+      if (samples == 32) {
+        EXPECT_LT(std::sqrt(e.variance()), 0.2 * expected);
+      }
     }
   }
 }
@@ -620,7 +622,9 @@ TEST(ManyLights, EmittersOfAllSizesAreDrawnWithoutBias) {
       const double error = std::hypot(e.standard_error(), plain.standard_error());
       EXPECT_NEAR(e.mean(), plain.mean(), 4 * error) << p.x << " " << samples;
       EXPECT_LT(error, 0.03 * plain.mean());
-      if (samples == 32) EXPECT_LT(std::sqrt(e.variance()), 0.15 * plain.mean());
+      if (samples == 32) {
+        EXPECT_LT(std::sqrt(e.variance()), 0.15 * plain.mean());
+      }
     }
   }
 }

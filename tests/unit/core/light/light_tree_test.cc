@@ -106,7 +106,9 @@ TEST(LightTree, ProbabilitiesAreThoseOfTheDraws) {
   EXPECT_NEAR(total, 1, 1e-3);
   for (uint32_t i = 0; i < 100; ++i) {
     // Those that are left out send less than a draw's worth.
-    if (hits[i] == 0) EXPECT_LT(chooser.WeightOf(i, p, kUp), 1e-3f * 256);
+    if (hits[i] == 0) {
+      EXPECT_LT(chooser.WeightOf(i, p, kUp), 1e-3f * 256);
+    }
   }
 }
 

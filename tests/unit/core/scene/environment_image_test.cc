@@ -286,7 +286,9 @@ TEST(EnvironmentMap, DirectionsAreOpenExrs) {
   for (int y = 0; y < 4; ++y) {
     for (int x = 0; x < 8; ++x) {
       EXPECT_NEAR(at(direction(x + 0.5, y + 0.5)), y * 8 + x, 1e-4);
-      if (x < 7) EXPECT_NEAR(at(direction(x + 1.0, y + 0.5)), y * 8 + x + 0.5, 1e-4);
+      if (x < 7) {
+        EXPECT_NEAR(at(direction(x + 1.0, y + 0.5)), y * 8 + x + 0.5, 1e-4);
+      }
     }
     EXPECT_NEAR(at(direction(8, y + 0.5)), y * 8 + 3.5, 1e-3);  // around
   }
