@@ -2,6 +2,7 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <cctype>
 #include <charconv>
 #include <cmath>
 #include <list>
@@ -533,7 +534,15 @@ absl::Status CheckCoordinator(const std::string& address) {
   const bool has_port = colon != std::string::npos && colon > 0 &&
                         std::from_chars(address.data() + colon + 1, end, port).ptr == end &&
                         port > 0 && port < 65536;
-  if (!has_port) {
+  // A host of colons stands in brackets. Everything else that is no name would reach gRPC as an
+  // address of some other scheme.
+  const std::string_view host = std::string_view(address).substr(0, has_port ? colon : 0);
+  const bool bracketed = host.size() > 2 && host.front() == '[' && host.back() == ']';
+  const bool good_host = std::all_of(host.begin(), host.end(), [&](char c) {
+    return std::isalnum(static_cast<unsigned char>(c)) != 0 || c == '-' || c == '.' || c == '_' ||
+           (bracketed && (c == ':' || c == '[' || c == ']' || c == '%'));
+  });
+  if (!has_port || !good_host) {
     return Bad("--coordinator " + address + ": expected HOST:PORT, e.g. farm.example:7447");
   }
   return absl::OkStatus();

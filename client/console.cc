@@ -76,6 +76,10 @@ std::string StateText(const JobStatus& status) {
     text += ", " + std::to_string(status.frames.done) + " of " +
             std::to_string(status.frames.total) + " frames";
   }
+  if (status.state == JobState::kRendering) {
+    text +=
+        ", " + std::to_string(static_cast<int>(std::clamp(status.progress, 0.0, 1.0) * 100)) + " %";
+  }
   return text;
 }
 

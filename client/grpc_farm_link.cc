@@ -29,7 +29,7 @@ constexpr seconds kWatchDeadline(600);
 constexpr seconds kBulkDeadline(60);
 constexpr size_t kSlowestBytesPerSecond = size_t{256} << 10;
 constexpr uint64_t kMaxTileBytes = uint64_t{1} << 32;
-constexpr int kMaxMessageBytes = 64 << 20;  // tile lists of large frames
+constexpr int kMaxMessageBytes = 128 << 20;  // what is known of the tiles and frames of a job
 
 grpc::ChannelArguments ChannelArguments() {
   grpc::ChannelArguments arguments;

@@ -131,8 +131,12 @@ TEST(CommandLine, Compression) {
 TEST(CommandLine, CoordinatorFromTheEnvironmentOrTheFlag) {
   EXPECT_EQ(Parse({"status"}, "env:1").coordinator, "env:1");
   EXPECT_EQ(Parse({"status", "--coordinator", "flag:2"}, "env:1").coordinator, "flag:2");
+  EXPECT_EQ(Parse({"status", "--coordinator", "[::1]:7447"}).coordinator, "[::1]:7447");
+  EXPECT_EQ(Parse({"status", "--coordinator", "my_farm-2.example:1"}).coordinator,
+            "my_farm-2.example:1");
   EXPECT_THAT(Refusal({"status"}), HasSubstr("FARPOINT_COORDINATOR"));
-  for (const char* address : {"host", "host:", ":1", "host:0", "host:65536", "host:1x"}) {
+  for (const char* address : {"host", "host:", ":1", "host:0", "host:65536", "host:1x", "ipv4:x:1",
+                              "::1:7447", "unix:/run/x:1", "a b:1", "[::1]x:1"}) {
     EXPECT_THAT(Refusal({"status", "--coordinator", address}), HasSubstr("HOST:PORT")) << address;
   }
 }

@@ -77,7 +77,25 @@ TEST(Console, WritesALinePerTenthWhereThereIsNoTerminal) {
   const std::string text = capture.Text();
   EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 11) << text;
   EXPECT_EQ(text.find('\x1b'), std::string::npos);
-  EXPECT_NE(text.find("farpoint: rendering, 50 of 100 tiles\n"), std::string::npos);
+  EXPECT_NE(text.find("farpoint: rendering, 50 of 100 tiles, 50 %\n"), std::string::npos);
+}
+
+TEST(Console, ReportsOfSeveralJobsNameThem) {
+  Capture capture;
+  Console console(capture.file(), true, ConsoleLevel::kInfo, false);
+  for (uint32_t i = 0; i <= 100; ++i) {
+    for (const char* id : {"a1", "b2"}) {
+      JobStatus status = Rendering(i, 100);
+      status.id = JobId{id};
+      status.frames = {.total = 5, .baked = 5, .done = i / 20};
+      console.Report(status);
+    }
+  }
+  const std::string text = capture.Text();
+  EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 22) << "a line per tenth and job" << text;
+  EXPECT_NE(text.find("farpoint: job b2 rendering, 50 of 100 tiles, 2 of 5 frames, 50 %\n"),
+            std::string::npos)
+      << text;
 }
 
 TEST(Console, RedrawsOneLineOnATerminal) {
@@ -115,6 +133,16 @@ TEST(ProgressText, NamesTheStateBeforeThereAreTiles) {
   JobStatus status;
   status.state = JobState::kBaking;
   EXPECT_EQ(ProgressText(status, 79), "baking");
+}
+
+TEST(ProgressText, SaysHowManyFramesAreDoneAndThatAJobRests) {
+  JobStatus status = Rendering(4, 8);
+  status.frames = {.total = 2, .baked = 2, .done = 1};
+  EXPECT_NE(ProgressText(status, 79).find("4/8 tiles  1/2 frames"), std::string::npos);
+  status.state = JobState::kPaused;
+  EXPECT_NE(ProgressText(status, 79).find("frames  paused"), std::string::npos);
+  status.tiles.committed = 0;
+  EXPECT_EQ(ProgressText(status, 79), "paused");
 }
 
 TEST(ProgressText, StaysInsideNarrowTerminalsAndOddNumbers) {

@@ -204,6 +204,13 @@ TEST_F(GrpcFarmLinkTest, AnAbsentCoordinatorIsUnavailableAtOnce) {
   EXPECT_LT(std::chrono::steady_clock::now() - start, std::chrono::seconds(5));
 }
 
+TEST_F(GrpcFarmLinkTest, TheLibraryWritesNothingOnItsOwn) {
+  testing::internal::CaptureStderr();
+  const auto link = MakeGrpcFarmLink("ipv4:no address:1", stop_);
+  EXPECT_FALSE(link->Status(JobId{"1"}).ok());
+  EXPECT_EQ(testing::internal::GetCapturedStderr(), "");
+}
+
 TEST_F(GrpcFarmLinkTest, ASignalEndsAWatch) {
   std::vector<uint64_t> sequences;
   std::thread raiser([&] {
