@@ -31,10 +31,10 @@ absl::StatusOr<FrameBake> FrameBakery::Bake(const JobSpec& spec, uint32_t index,
   if (known) {
     bake = *std::move(known);
     result.reused = true;
-    // The time was spent by the job that baked.
+    // The time was spent by the job that baked, and what it skipped is its affair.
     bake.stats.seconds = {};
     bake.stats.wall_seconds = {};
-    bake.stats.skipped["bake"] = 1;
+    bake.stats.skipped = {{"bake", 1}};
   } else {
     FP_ASSIGN_OR_RETURN(bake, Make(spec, time_s, stop));
     FP_RETURN_IF_ERROR(store_.PutBake(bake.animated ? now : always, bake));

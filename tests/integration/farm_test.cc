@@ -211,6 +211,69 @@ TEST_F(FarmTest, ACancelledJobEndsForAllWhoWait) {
             0);
 }
 
+// What people have said about their jobs survives as their tiles do.
+TEST_F(FarmTest, PausesChainsRequeuesAndFramesSurviveAKill) {
+  const auto frames = SmallScene() + std::vector<std::string>{"--frames", "1-3"};
+  const std::string paused = Detach(frames + std::vector<std::string>{"--paused"});
+  const std::string first = Detach(LongJob());
+  const std::string chained = Detach(SmallScene() + std::vector<std::string>{"--after", first});
+  const std::string taken_up = Detach(frames);
+  const auto status = [&](const std::string& job) { return Json::parse(farm_.Status(job)); };
+  EXPECT_TRUE(WaitUntil(seconds(30), [&] { return StateOf(taken_up) == "rendering"; }));
+  EXPECT_EQ(Run({"cancel", taken_up}).exit_code, 0);
+  EXPECT_EQ(Run({"requeue", taken_up}).exit_code, 0);
+  EXPECT_EQ(Run({"priority", taken_up, "7"}).exit_code, 0);
+  const Json frames_before = status(taken_up)["frames"];
+  farm_.server().Signal(SIGKILL);
+  farm_.server().Wait(seconds(10));
+  farm_.StartServer();
+
+  EXPECT_EQ(StateOf(paused), "paused");
+  EXPECT_EQ(StateOf(chained), "queued");
+  EXPECT_EQ(StateOf(taken_up), "rendering");
+  EXPECT_EQ(status(taken_up)["priority"], 7);
+  EXPECT_GE(status(taken_up)["frames"]["baked"], frames_before["baked"]);
+  EXPECT_EQ(status(taken_up)["tiles"]["total"], 12);
+  EXPECT_THAT(Run({"explain", paused}).out, HasSubstr("farpoint resume " + paused));
+  EXPECT_THAT(Run({"explain", chained}).out, HasSubstr("waits for job " + first));
+
+  farm_.StartWorker();
+  EXPECT_TRUE(WaitUntil(seconds(60), [&] { return StateOf(taken_up) == "done"; })) << farm_.Logs();
+  EXPECT_EQ(Run({"resume", paused}).exit_code, 0);
+  EXPECT_EQ(Run({"priority", paused, "5"}).exit_code, 0);
+  EXPECT_TRUE(WaitUntil(seconds(60), [&] { return StateOf(paused) == "done"; })) << farm_.Logs();
+  EXPECT_EQ(StateOf(chained), "queued");
+  // What it waits for will not be done.
+  EXPECT_EQ(Run({"cancel", first}).exit_code, 0);
+  EXPECT_EQ(StateOf(chained), "failed");
+  EXPECT_THAT(status(chained)["error"].get<std::string>(), HasSubstr(first));
+
+  ASSERT_EQ(Run({"fetch", taken_up, "-o", farm_.File("taken.####.exr")}).exit_code, 0);
+  ASSERT_EQ(Run({"fetch", paused, "-o", farm_.File("paused.####.exr")}).exit_code, 0);
+  for (const char* frame : {"0001", "0003"}) {
+    const std::string name = std::string(".") + frame + ".exr";
+    EXPECT_EQ(ImageHashOf(farm_.File("taken" + name)), ImageHashOf(farm_.File("paused" + name)));
+  }
+}
+
+TEST(Services, ABadAddressIsWrongUsage) {
+  Farm farm;
+  for (const char* address : {"nowhere", "host:99999", ":7447"}) {
+    for (const std::vector<std::string>& args :
+         {std::vector<std::string>{"farpoint-server", "--listen", address, "--store",
+                                   farm.File("store")},
+          {"farpoint-worker", "--coordinator", address, "--cache", farm.File("cache")}}) {
+      std::vector<std::string> command = args;
+      command[0] = BinFolder() + "/" + command[0];
+      const std::string name = args[0] + address;
+      Process process(command, farm.File(name), farm.File(name));
+      EXPECT_EQ(process.Wait(seconds(20)), 2) << name;
+      EXPECT_THAT(farm.Read(name), AllOf(StartsWith(args[0] + ": " + args[1]), HasSubstr(address),
+                                         HasSubstr("HOST:PORT")));
+    }
+  }
+}
+
 TEST_F(FarmTest, AnUnknownJobIsAPermanentError) {
   for (const std::vector<std::string>& args : {std::vector<std::string>{"status", "deadbeef"},
                                                {"cancel", "deadbeef"},

@@ -161,7 +161,7 @@ TEST_F(Refusal, OfWrongUsageIsExitCode2) {
            {"render", good, "-o", "a.exr", "--clusters", "adaptive"},
            {"render", good, "-o", "a.exr", "--bounces", "2"},
            {"render", good, "-o", "a.exr", "--eye", "0,0,0"},
-           {"render", "scene.obj", "-o", "a.exr"},
+           {"render", "scene.fbx", "-o", "a.exr"},
            {"submit", good, "-o", "a.exr"},
            {"status", "--coordinator", "nonsense"}}) {
     const RunResult result = farm_->Client(args);

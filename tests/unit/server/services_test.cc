@@ -120,6 +120,90 @@ class ServicesTest : public ::testing::Test {
   std::unique_ptr<v1::WorkerService::Stub> workers_;
 };
 
+TEST_F(ServicesTest, JobsArePausedOrderedRequeuedAndExplained) {
+  v1::SubmitRequest request = Request();
+  request.mutable_job()->set_start_paused(true);
+  for (const int frame : {3, 5}) request.mutable_job()->add_frames(frame);
+  v1::SubmitResponse submitted;
+  {
+    Call call;
+    ASSERT_TRUE(jobs_->Submit(&call, request, &submitted).ok());
+  }
+  const std::string& id = submitted.job_id();
+  const auto status = [&] {
+    Call call;
+    v1::StatusRequest ask;
+    ask.set_job_id(id);
+    v1::StatusResponse answer;
+    EXPECT_TRUE(jobs_->Status(&call, ask, &answer).ok());
+    return *JobStatusFromWire(answer.jobs(0));
+  };
+  EXPECT_EQ(status().state, JobState::kPaused);
+  EXPECT_EQ(status().frames.total, 2u);
+  EXPECT_EQ(status().tiles.total, 32u);
+  {
+    Call call;
+    v1::ExplainRequest ask;
+    ask.set_job_id(id);
+    v1::ExplainResponse answer;
+    ASSERT_TRUE(jobs_->Explain(&call, ask, &answer).ok());
+    EXPECT_THAT(ExplanationFromWire(answer)->lines.front(), HasSubstr("paused"));
+  }
+  {
+    Call call;
+    v1::SetPriorityRequest ask;
+    ask.set_job_id(id);
+    ask.set_priority(-3);
+    v1::SetPriorityResponse answer;
+    ASSERT_TRUE(jobs_->SetPriority(&call, ask, &answer).ok());
+    EXPECT_EQ(status().priority, -3);
+    ask.set_priority(5000);
+    Call refused;
+    EXPECT_EQ(jobs_->SetPriority(&refused, ask, &answer).error_code(),
+              grpc::StatusCode::INVALID_ARGUMENT);
+  }
+  {
+    Call call;
+    v1::ResumeRequest ask;
+    ask.set_job_id(id);
+    v1::ResumeResponse answer;
+    ASSERT_TRUE(jobs_->Resume(&call, ask, &answer).ok());
+    EXPECT_NE(status().state, JobState::kPaused);
+  }
+  {
+    Call call;
+    v1::PauseRequest ask;
+    ask.set_job_id(id);
+    v1::PauseResponse answer;
+    ASSERT_TRUE(jobs_->Pause(&call, ask, &answer).ok());
+    EXPECT_EQ(status().state, JobState::kPaused);
+  }
+  ASSERT_TRUE(coordinator_->Cancel({id}).ok());
+  {
+    Call call;
+    v1::RequeueRequest ask;
+    ask.set_job_id(id);
+    ask.set_all(true);
+    v1::RequeueResponse answer;
+    ASSERT_TRUE(jobs_->Requeue(&call, ask, &answer).ok());
+  }
+  FarWorker worker(address_, folder_ / "a", {});
+  for (int i = 0; i < 500 && !IsFinal(status().state); ++i) {
+    std::this_thread::sleep_for(milliseconds(20));
+  }
+  EXPECT_EQ(status().state, JobState::kDone);
+  EXPECT_EQ(status().frames, (FrameCounts{.total = 2, .baked = 2, .done = 2}));
+  Call call;
+  v1::FetchInfoRequest ask;
+  ask.set_job_id(id);
+  v1::FetchInfoResponse answer;
+  ASSERT_TRUE(jobs_->FetchInfo(&call, ask, &answer).ok());
+  const auto info = JobInfoFromWire(answer);
+  ASSERT_TRUE(info.ok()) << info.status();
+  EXPECT_EQ(info->frames[1].number, 5);
+  EXPECT_EQ(info->tiles[16].frame, 1u);
+}
+
 TEST_F(ServicesTest, TwoWorkersRenderAJobThoughAThirdVanishesInMidTile) {
   v1::SubmitResponse submitted;
   {
