@@ -89,9 +89,9 @@ class CoordinatorApi {
   virtual absl::Status Requeue(const JobId& job, bool all) = 0;
   virtual absl::StatusOr<Explanation> Explain(const JobId& job) = 0;
   // Events with sequence > `after_sequence`, in order, at most 256. Waits up to `wait` for one; if
-  // none comes, a single passing report of progress (sequence 0). Once a job has ended and all its
-  // events are told, the answer is an empty list at once. Its final JobState is then among them; it
-  // is the last one unless a late result was refused after it. A requeued job goes on telling.
+  // none comes, a single passing report of progress (sequence 0). The last event of a job that has
+  // ended is its final JobState; asking for what follows it answers with an empty list at once. A
+  // job that is requeued goes on with the next number.
   virtual absl::StatusOr<std::vector<JobEvent>> NextEvents(const JobId& job,
                                                            uint64_t after_sequence,
                                                            std::chrono::milliseconds wait) = 0;
