@@ -14,6 +14,9 @@ namespace {
 
 constexpr double kCounts = 0x1p31;
 constexpr double kBelowOne = 1.0 - 0x1p-53;
+// The sun's cells are this much brighter than the mean, and this wide at most in all.
+constexpr double kSunContrast = 16;
+constexpr double kSunSolidAngle = 0.02;
 constexpr uint32_t kMinWidth = 96, kMinHeight = 48;
 constexpr uint64_t kMaxRefined = uint64_t{1} << 26;
 
@@ -93,6 +96,7 @@ EnvironmentSampler::EnvironmentSampler(const PreparedScene& scene)
     }
   }
   BuildCells(power);
+  FindSun(power);
   texel_begin_.resize(power.size());
   for (uint32_t cell = 0; cell < kCells; ++cell) BuildDistribution(cell, power);
 }
@@ -157,6 +161,31 @@ void EnvironmentSampler::BuildCells(const std::vector<float>& power) {
     }
   }
   std::copy(rects.begin() + kCells, rects.end(), rect_.begin());
+}
+
+void EnvironmentSampler::FindSun(const std::vector<float>& power) {
+  std::array<double, kCells> cell_power{}, solid_angle{};
+  double total = 0;
+  for (uint32_t cell = 0; cell < kCells; ++cell) {
+    const Rect& r = rect_[cell];
+    for (uint32_t y = r.y0; y < r.y1; ++y) {
+      for (uint32_t x = r.x0; x < r.x1; ++x) {
+        cell_power[cell] += static_cast<double>(power[size_t{y} * width_ + x]);
+      }
+    }
+    solid_angle[cell] =
+        2 * kPi * (r.x1 - r.x0) / width_ *
+        (DetSinCos(LatitudeAt(r.y0, height_)).sin - DetSinCos(LatitudeAt(r.y1, height_)).sin);
+    total += cell_power[cell];
+  }
+  double sun = 0;
+  for (uint32_t cell = 0; cell < kCells; ++cell) {
+    const bool bright = cell_power[cell] * 4 * kPi > kSunContrast * total * solid_angle[cell];
+    is_sun_[cell] = bright ? ~0u : 0u;
+    if (bright) sun += solid_angle[cell];
+  }
+  has_sun_ = sun > 0 && sun < kSunSolidAngle;
+  if (!has_sun_) is_sun_.fill(0);
 }
 
 void EnvironmentSampler::BuildDistribution(uint32_t cell, std::vector<float>& power) {
@@ -236,21 +265,35 @@ void EnvironmentSampler::LookAlong(const Vec3f& normal, View& view) const {
     const F8 s = Load8(&spread_[i]);
     const F8 above = Max8(a + s, zero);
     const F8 parabola = above * above / Max8(Set8(4) * s, least);
-    Store8(&view.weight[kCells + i], Select8(a >= s, a, parabola));
+    const F8 weight = Select8(a >= s, a, parabola);
+    const M8 sun = reinterpret_cast<M8>(Load8(reinterpret_cast<const float*>(&is_sun_[i])));
+    Store8(&view.weight[0][kCells + i], Select8(sun, weight, zero));
+    Store8(&view.weight[1][kCells + i], Select8(sun, zero, weight));
   }
-  for (uint32_t i = kCells - 1; i > 0; --i) {
-    view.weight[i] = view.weight[2 * i] + view.weight[2 * i + 1];
+  for (unsigned group = has_sun_ ? 0 : 1; group < 2; ++group) {
+    auto& w = view.weight[group];
+    for (uint32_t i = kCells - 1; i > 0; --i) w[i] = w[2 * i] + w[2 * i + 1];
+  }
+  const double sun = has_sun_ ? static_cast<double>(view.weight[0][1]) : 0.0;
+  const auto rest = static_cast<double>(view.weight[1][1]);
+  view.sun_share = 0;
+  if (sun > 0) {
+    const double eighths = static_cast<double>(static_cast<int>(8.0 * sun / (sun + rest) + 0.5));
+    view.sun_share = rest > 0 ? std::clamp(eighths, 1.0, 4.0) / 8.0 : 1.0;
   }
 }
 
 std::optional<EnvironmentSampler::Draw> EnvironmentSampler::Sample(const View& view, double u,
                                                                    double v) const {
-  if (!(view.weight[1] > 0)) return std::nullopt;
-  double probability = 1;
+  const bool to_sun = u < view.sun_share;
+  const auto& weight = view.weight[to_sun ? 0 : 1];
+  double probability = to_sun ? view.sun_share : 1.0 - view.sun_share;
+  u = std::clamp((to_sun ? u : u - view.sun_share) / probability, 0.0, kBelowOne);
+  if (!(weight[1] > 0)) return std::nullopt;
   uint32_t node = 1;
   while (node < kCells) {
-    const auto left = static_cast<double>(view.weight[2 * node]);
-    const auto right = static_cast<double>(view.weight[2 * node + 1]);
+    const auto left = static_cast<double>(weight[2 * node]);
+    const auto right = static_cast<double>(weight[2 * node + 1]);
     const double part = left / (left + right);
     double& x = splits_rows_[node] ? v : u;
     if (x < part) {

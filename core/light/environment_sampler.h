@@ -6,7 +6,12 @@
 // The cosine enters by 256 cells, rectangles of the map that halve what is bright and what is wide:
 // each knows the mean direction of its light and how far it spreads about that, so the choice among
 // the cells follows the normal, and a sun is a cell of its own. Within a cell the choice does not
-// depend on the normal. Sums run in a fixed order; probabilities are counts of 2^-31, so that what
+// depend on the normal.
+// A sun takes most of the light and needs the fewest samples: its cells all see or miss it alike.
+// So cells far brighter than the mean, if together they are small, are a group apart, which gets as
+// many eighths of the samples as it has of the light, but at least one and at most four: a whole
+// number, so that the sun's share has no noise, and its shadow is not left to a few samples.
+// Sums run in a fixed order; probabilities are counts of 2^-31, so that what
 // is divided by is what was used.
 #pragma once
 
@@ -32,8 +37,10 @@ class EnvironmentSampler {
   // The cells as a surface of one unit normal sees them. Cost: about the time of a ray.
   struct View {
     Vec3d n_map;  // the normal in the map's frame
-    // A binary heap from index 1: sums over the cells, which stand in the second half.
-    alignas(32) std::array<float, 2 * kCells> weight;
+    // Binary heaps from index 1: sums over the cells, which stand in the second half. The first is
+    // of the sun's cells, the second of all others.
+    alignas(32) std::array<std::array<float, 2 * kCells>, 2> weight;
+    double sun_share;  // of the samples
   };
   void LookAlong(const Vec3f& normal, View& view) const;
 
@@ -52,6 +59,7 @@ class EnvironmentSampler {
   };
   Rgb Radiance(uint32_t x, uint32_t y) const;  // of a texel, with the sky
   void BuildCells(const std::vector<float>& power);
+  void FindSun(const std::vector<float>& power);
   void BuildDistribution(uint32_t cell, std::vector<float>& power);
 
   const PreparedScene& scene_;
@@ -62,6 +70,9 @@ class EnvironmentSampler {
   // By cell: Σ power direction, in the map's frame; the length of that times the sine of the angle
   // about its direction within which the cell lies.
   alignas(32) std::array<float, kCells> x_{}, y_{}, z_{}, spread_{};
+  // By cell: all bits set for the sun's.
+  alignas(32) std::array<uint32_t, kCells> is_sun_{};
+  bool has_sun_ = false;
   std::array<uint32_t, kCells> first_row_{};  // into row_begin_
   // Where each row of a cell and each texel of such a row begins, in counts of 2^-31.
   std::vector<uint32_t> row_begin_;

@@ -141,6 +141,27 @@ TEST(EnvironmentSampler, ATinySunConvergesAtOnce) {
   EXPECT_LT(RelativeRms(sky, Vec3f(Normalize(side - to_sun * 0.1)), 32, kPi), 0.06);
 }
 
+// In the sun's shadow the rest of the map still has half of the samples, exactly.
+TEST(EnvironmentSampler, ASunTakesHalfOfTheSamplesAtMost) {
+  const auto drawn_of_sun = [](float radiance) {
+    const Sky sky(512, 256, [&](uint32_t x, uint32_t y) {
+      return Rgb((x == 255 || x == 256) && y == 40 ? radiance : 1.0f);
+    });
+    EnvironmentSampler::View view;
+    sky.sampler->LookAlong({0, 1, 0}, view);
+    int count = 0;
+    for (uint32_t i = 0; i < 32; ++i) {
+      const auto draw = sky.sampler->Sample(view, OwenSobolBits(i, 0, 9) * 0x1p-32,
+                                            OwenSobolBits(i, 1, 9) * 0x1p-32);
+      count += draw && sky.scene->EnvironmentRadiance(draw->direction).x > 1 ? 1 : 0;
+    }
+    return count;
+  };
+  EXPECT_EQ(drawn_of_sun(1e9f), 16);
+  EXPECT_EQ(drawn_of_sun(1e5f), 16);
+  EXPECT_EQ(drawn_of_sun(2000), 4);
+}
+
 TEST(EnvironmentSampler, DirectionsAreUnitAboveTheHorizonAndLit) {
   const Sky sky(64, 32, [](uint32_t x, uint32_t y) { return y < 16 && x < 9 ? Rgb(2) : Rgb(); });
   TestRandom random(4);
