@@ -3,6 +3,7 @@
 #include <absl/strings/str_format.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <nlohmann/json.hpp>
 #include <utility>
@@ -70,13 +71,13 @@ class Rebake {
     const std::string object_name =
         "object " + std::to_string(object) + " ('" + base_.instances[object].name + "')";
 
-    FP_RETURN_IF_ERROR(Add("same", "nothing, or the camera only", base_));
+    Add("same", "nothing, or the camera only", base_);
     {
       Scene scene = base_;
       for (PunctualLight& light : scene.lights) light.intensity *= 0.5f;
       for (Material& material : scene.materials) material.emission *= 0.75f;
       scene.environment.sky *= 0.75f;
-      FP_RETURN_IF_ERROR(Add("light colour", "lights, emitters and sky dimmed", scene));
+      Add("light colour", "lights, emitters and sky dimmed", scene);
     }
     {
       Scene scene = base_;
@@ -84,29 +85,34 @@ class Rebake {
         light.position += Vec3d(0.01, 0.02, 0.03);
         light.direction = Normalize(light.direction + Vec3d(0.2, 0.05, -0.1));
       }
-      FP_RETURN_IF_ERROR(Add("light moved", "punctual lights moved and turned", scene));
+      Add("light moved", "punctual lights moved and turned", scene);
     }
     {
       Scene scene = base_;
       for (Material& material : scene.materials) material.base_color *= 0.75f;
-      FP_RETURN_IF_ERROR(Add("material", "base colours darkened", scene));
+      Add("material", "base colours darkened", scene);
     }
     {
       Scene scene = base_;
       scene.instances[object].world_from_mesh.translation += Vec3d(0.02, 0.01, 0.03);
-      FP_RETURN_IF_ERROR(Add("object moved", object_name, scene));
+      Add("object moved", object_name, scene);
     }
     {
       Scene scene = base_;
       Affine& m = scene.instances[object].world_from_mesh;
       m = Turned(m, 0.96, 0.28);
-      FP_RETURN_IF_ERROR(Add("object turned", object_name, scene));
+      Add("object turned", object_name, scene);
     }
     {
       Scene scene = base_;
       scene.instances.erase(scene.instances.begin() + static_cast<ptrdiff_t>(object));
-      if (!scene.instances.empty()) FP_RETURN_IF_ERROR(Add("object removed", object_name, scene));
+      if (!scene.instances.empty()) Add("object removed", object_name, scene);
     }
+    const uint32_t repeats = options_.quick ? 1 : options_.repeat;
+    for (uint32_t i = 0; i < repeats; ++i) FP_RETURN_IF_ERROR(Round(i));
+    for (const Change& change : changes_) report_.cases.push_back(Summary(change));
+    report_.triangles = report_.cases.front().cold.counts["triangles"];
+    report_.surfels = report_.cases.front().cold.counts["surfels"];
     return std::move(report_);
   }
 
@@ -123,47 +129,57 @@ class Rebake {
     return timed;
   }
 
-  static Timed Median(std::vector<Timed> times) {
-    std::sort(times.begin(), times.end(),
-              [](const Timed& a, const Timed& b) { return a.seconds < b.seconds; });
-    return std::move(times[times.size() / 2]);
+  struct Change {
+    std::string name, what;
+    Scene scene;
+    std::vector<Timed> cold, warm;  // by round
+  };
+
+  void Add(const std::string& name, const std::string& what, const Scene& scene) {
+    changes_.push_back({name, what, scene, {}, {}});
   }
 
-  absl::Status Add(const std::string& name, const std::string& what, const Scene& scene) {
-    log_("rebake: " + name);
-    std::vector<Timed> cold, warm;
-    Hashes before;
-    const uint32_t repeats = options_.quick ? 1 : options_.repeat;
-    for (uint32_t i = 0; i < repeats; ++i) {
-      BakeCache empty(options_.cache_bytes), filled(options_.cache_bytes);
-      FP_ASSIGN_OR_RETURN(Timed first, BakeOnce(scene, empty));
-      cold.push_back(std::move(first));
-      FP_ASSIGN_OR_RETURN(const Timed base, BakeOnce(base_, filled));
-      before = base.hashes;
-      FP_ASSIGN_OR_RETURN(Timed second, BakeOnce(scene, filled));
-      warm.push_back(std::move(second));
-      report_.cache_bytes_used = std::max(report_.cache_bytes_used, filled.size_bytes());
-      if (warm.back().hashes != cold.front().hashes || cold.back().hashes != cold.front().hashes) {
-        return absl::InternalError("'" + name +
+  // Every change once. All follow the same first bake: what one leaves is of no use to another, as
+  // they change different things.
+  absl::Status Round(uint32_t round) {
+    BakeCache filled(options_.cache_bytes);
+    FP_ASSIGN_OR_RETURN(const Timed base, BakeOnce(base_, filled));
+    base_topology_ = base.hashes.topology;
+    for (Change& change : changes_) {
+      log_("rebake: round " + std::to_string(round) + ", " + change.name);
+      FP_ASSIGN_OR_RETURN(Timed warm, BakeOnce(change.scene, filled));
+      BakeCache empty(options_.cache_bytes);
+      FP_ASSIGN_OR_RETURN(Timed cold, BakeOnce(change.scene, empty));
+      change.warm.push_back(std::move(warm));
+      change.cold.push_back(std::move(cold));
+      if (change.warm.back().hashes != change.cold.front().hashes ||
+          change.cold.back().hashes != change.cold.front().hashes) {
+        return absl::InternalError("'" + change.name +
                                    "': the warm bake's blobs are not those of the cold one");
       }
     }
-    RebakeCase c;
-    c.name = name;
-    c.what = what;
-    c.topology_same_as_before = warm.front().hashes.topology == before.topology;
-    Timed median = Median(std::move(cold));
-    c.cold_s = median.seconds;
-    c.cold = std::move(median.stats);
-    median = Median(std::move(warm));
-    c.warm_s = median.seconds;
-    c.warm = std::move(median.stats);
-    if (report_.cases.empty()) {
-      report_.triangles = c.cold.counts["triangles"];
-      report_.surfels = c.cold.counts["surfels"];
-    }
-    report_.cases.push_back(std::move(c));
+    report_.cache_bytes_used = std::max(report_.cache_bytes_used, filled.size_bytes());
     return absl::OkStatus();
+  }
+
+  static const Timed& Median(const std::vector<Timed>& times) {
+    std::vector<const Timed*> sorted;
+    for (const Timed& t : times) sorted.push_back(&t);
+    std::sort(sorted.begin(), sorted.end(),
+              [](const Timed* a, const Timed* b) { return a->seconds < b->seconds; });
+    return *sorted[sorted.size() / 2];
+  }
+
+  RebakeCase Summary(const Change& change) const {
+    const Timed& cold = Median(change.cold);
+    const Timed& warm = Median(change.warm);
+    return {.name = change.name,
+            .what = change.what,
+            .cold_s = cold.seconds,
+            .warm_s = warm.seconds,
+            .cold = cold.stats,
+            .warm = warm.stats,
+            .topology_same_as_before = warm.hashes.topology == base_topology_};
   }
 
   const RebakeOptions& options_;
@@ -171,17 +187,24 @@ class Rebake {
   Executor executor_;
   RenderSettings settings_;
   Scene base_;
+  Digest base_topology_;
+  std::vector<Change> changes_;
   RebakeReport report_;
 };
 
-nlohmann::ordered_json SecondsJson(double total, const Stats& stats) {
+nlohmann::ordered_json SecondsJson(const std::array<double, kStageCount>& seconds) {
   nlohmann::ordered_json json;
-  json["total"] = total;
   for (const Stage stage : kStages) {
     const auto i = static_cast<size_t>(stage);
-    json[kStageNames[i]] = stats.wall_seconds[i];
+    json[kStageNames[i]] = seconds[i];
   }
   return json;
+}
+
+double Sum(const std::array<double, kStageCount>& seconds) {
+  double sum = 0;
+  for (const Stage stage : kStages) sum += seconds[static_cast<size_t>(stage)];
+  return sum;
 }
 
 }  // namespace
@@ -206,8 +229,12 @@ std::string RebakeJson(const RebakeReport& report) {
     nlohmann::ordered_json entry;
     entry["name"] = c.name;
     entry["what"] = c.what;
-    entry["cold_wall_seconds"] = SecondsJson(c.cold_s, c.cold);
-    entry["warm_wall_seconds"] = SecondsJson(c.warm_s, c.warm);
+    entry["cold_seconds"] = c.cold_s;
+    entry["warm_seconds"] = c.warm_s;
+    entry["cold_wall_seconds"] = SecondsJson(c.cold.wall_seconds);
+    entry["warm_wall_seconds"] = SecondsJson(c.warm.wall_seconds);
+    entry["cold_thread_seconds"] = SecondsJson(c.cold.seconds);
+    entry["warm_thread_seconds"] = SecondsJson(c.warm.seconds);
     entry["warm_counts"] = c.warm.counts;
     entry["warm_skipped"] = c.warm.skipped;
     entry["topology_same_as_before"] = c.topology_same_as_before;
@@ -218,28 +245,31 @@ std::string RebakeJson(const RebakeReport& report) {
 
 std::string RebakeTable(const RebakeReport& report) {
   std::string text = absl::StrFormat(
-      "%s: %d triangles, %d surfels; wall seconds; blobs of warm bakes are those of cold ones\n\n"
-      "%-16s %7s %7s   %7s %7s %7s %7s   %9s %9s %s\n",
-      report.options.scene, report.triangles, report.surfels, "change", "cold", "warm", "import",
-      "sample", "shade", "tree", "kept", "shading", "topology");
-  const auto add = [&text](const std::string& name, double cold, double total, const Stats& stats,
-                           const std::string& topology) {
+      "%s: %d triangles, %d surfels, %d threads; blobs of warm bakes are those of cold ones\n\n"
+      "%-16s %15s %15s %33s\n%-16s %7s %7s %7s %7s   %7s %7s %7s %7s   %9s %9s %s\n",
+      report.options.scene, report.triangles, report.surfels,
+      Executor(report.options.threads).threads(), "", "cold", "warm", "wall seconds of the stages",
+      "change", "wall", "cpu", "wall", "cpu", "import", "sample", "shade", "tree", "kept",
+      "shading", "topology");
+  const auto add = [&text](const RebakeCase& c, const std::string& name, double warm_s,
+                           const Stats& stats, const std::string& topology) {
     const auto seconds = [&stats](Stage s) { return stats.wall_seconds[static_cast<size_t>(s)]; };
     const auto skipped = [&stats](const char* key) -> uint64_t {
       const auto it = stats.skipped.find(key);
       return it == stats.skipped.end() ? 0 : it->second;
     };
-    text += absl::StrFormat("%-16s %7.2f %7.2f   %7.2f %7.2f %7.2f %7.2f   %9d %9d %s\n", name,
-                            cold, total, seconds(Stage::kImport), seconds(Stage::kSample),
-                            seconds(Stage::kShade), seconds(Stage::kTree), skipped("surfels_kept"),
-                            skipped("surfels_shaded_kept"), topology);
+    text += absl::StrFormat(
+        "%-16s %7.2f %7.2f %7.2f %7.2f   %7.2f %7.2f %7.2f %7.2f   %9d %9d %s\n", name, c.cold_s,
+        Sum(c.cold.seconds), warm_s, Sum(stats.seconds), seconds(Stage::kImport),
+        seconds(Stage::kSample), seconds(Stage::kShade), seconds(Stage::kTree),
+        skipped("surfels_kept"), skipped("surfels_shaded_kept"), topology);
   };
   if (!report.cases.empty()) {
-    add("(cold)", report.cases.front().cold_s, report.cases.front().cold_s,
-        report.cases.front().cold, "");
+    const RebakeCase& c = report.cases.front();
+    add(c, "(cold)", c.cold_s, c.cold, "");
   }
   for (const RebakeCase& c : report.cases) {
-    add(c.name, c.cold_s, c.warm_s, c.warm, c.topology_same_as_before ? "same" : "new");
+    add(c, c.name, c.warm_s, c.warm, c.topology_same_as_before ? "same" : "new");
   }
   return text;
 }
