@@ -125,6 +125,52 @@ TEST(CoreBaker, BakesAgainOnlyWhatChanged) {
   EXPECT_NE(sun.blobs.tree_radiance.Hash(), first.blobs.tree_radiance.Hash());
 }
 
+// A square that stands still and one that grows from edge 1 to edge 9 in a second.
+constexpr char kGrowingSquare[] = R"({"asset":{"version":"2.0"},"scene":0,
+ "scenes":[{"nodes":[0,1]}],"nodes":[{"mesh":0},{"mesh":0,"translation":[0,0,3]}],
+ "meshes":[{"primitives":[{"attributes":{"POSITION":0},"indices":1}]}],
+ "animations":[{"samplers":[{"input":2,"output":3}],
+  "channels":[{"sampler":0,"target":{"node":1,"path":"scale"}}]}],
+ "accessors":[
+  {"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,1,0]},
+  {"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"},
+  {"bufferView":2,"componentType":5126,"count":2,"type":"SCALAR","min":[0],"max":[1]},
+  {"bufferView":3,"componentType":5126,"count":2,"type":"VEC3"}],
+ "bufferViews":[{"buffer":0,"byteLength":48},{"buffer":0,"byteOffset":48,"byteLength":12},
+  {"buffer":0,"byteOffset":60,"byteLength":8},{"buffer":0,"byteOffset":68,"byteLength":24}],
+ "buffers":[{"byteLength":92,"uri":"data:application/octet-stream;base64,@"}]})";
+// Its 92 bytes: four positions, six indices, two times, two scales.
+constexpr char kGrowingSquareData[] =
+    "AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAACAPwAAgD8AAAAAAAAAAAAAgD8AAAAAAAABAAIAAAACAAMA"
+    "AAAAAAAAgD8AAIA/AACAPwAAgD8AABBBAAAQQQAAEEE=";
+
+TEST(CoreBaker, FramesHaveTheDensityOfTheSceneAtRest) {
+  std::string gltf = kGrowingSquare;
+  gltf.replace(gltf.find('@'), 1, kGrowingSquareData);
+  AssetBundle asset;
+  asset.root = "a.gltf";
+  asset.files["a.gltf"] = Blob::FromString(gltf);
+  const auto baker = MakeCoreBaker(1), forgetful = MakeCoreBaker(1, 0);
+  const std::atomic<bool> cancel = false;
+  JobSpec spec = SmallJob();
+  spec.settings.light_samples = 1;
+  const auto surfels = [&](SceneBaker& b, std::optional<double> time_s) {
+    auto result = b.Bake(asset, spec, time_s, cancel);
+    EXPECT_TRUE(result.ok()) << result.status();
+    return std::pair(result->stats.counts["surfels"], result->stats.skipped["surfels_kept"]);
+  };
+  // 500 on two square metres, at rest and at the beginning.
+  const uint64_t at_rest = surfels(*baker, std::nullopt).first;
+  EXPECT_NEAR(static_cast<double>(at_rest), 500, 50);
+  EXPECT_EQ(surfels(*baker, 0.0).first, at_rest);
+  // At the end there are 82 m², as dense as before, and the square that stands still has its own.
+  const auto [at_end, kept] = surfels(*baker, 1.0);
+  EXPECT_NEAR(static_cast<double>(at_end), 500.0 * 82 / 2, 0.06 * 500 * 41);
+  EXPECT_NEAR(static_cast<double>(kept), 250, 25);
+  // Whoever bakes that frame first has the same.
+  EXPECT_EQ(surfels(*forgetful, 1.0).first, at_end);
+}
+
 TEST(CoreBaker, ABrokenAssetIsThePersonsErrorNotOurs) {
   AssetBundle asset;
   asset.root = "a.gltf";
