@@ -211,9 +211,6 @@ class Options {
   }
 
   absl::Status Unknown(const std::string& name) const {
-    for (const RefusedFlag& flag : RefusedFlags()) {
-      if (name == flag.name) return Bad(name + ": " + std::string(flag.reason));
-    }
     const std::string nearest = NearestName(name, names_);
     return Bad(name + ": unknown flag of farpoint " + app_.get_name() +
                (nearest.empty() ? "; see farpoint " + app_.get_name() + " --help"

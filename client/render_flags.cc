@@ -138,11 +138,12 @@ absl::Status ApplyCrop(std::string_view value, JobEdit& edit) {
 
 absl::Status ApplyClusters(std::string_view value, JobEdit& edit) {
   if (value == "adaptive") {
-    return Bad("adaptive clusters are not built yet; give the number of clusters per block");
+    edit.spec.settings.clusters = 0;
+    return absl::OkStatus();
   }
   uint32_t clusters = 0;
   FP_RETURN_IF_ERROR(ParseCount(value, clusters));
-  if (clusters == 0) return Bad("expected the number of clusters per block, 1..1024");
+  if (clusters == 0) return Bad("expected adaptive or the number of clusters per block, 1..1024");
   edit.spec.settings.clusters = clusters;
   return absl::OkStatus();
 }
@@ -395,7 +396,24 @@ constexpr RenderFlag kRenderFlags[] = {
                           {Choice<Splat>{"coverage", Splat::kCoverage}, {"opaque", Splat::kOpaque}},
                           edit.spec.settings.splat);
      }},
-    {"--clusters", "N", kMethod, "fpbgi: clusters per block, 1..1024; default 64", ApplyClusters},
+    {"--clusters", "adaptive|N", kMethod,
+     "fpbgi: adaptive (the default): clusters follow the scene, coarse to fine; N: so many per "
+     "block "
+     "of 32x32 pixels, 1..1024, as the paper",
+     ApplyClusters},
+    {"--fill", "HOW", kMethod,
+     "fpbgi: what fills a cluster's buffer: rays, a cut of the point tree, or auto (the default: "
+     "rays for adaptive clusters, cut for N)",
+     [](std::string_view value, JobEdit& edit) {
+       FP_ASSIGN_OR_RETURN(edit.spec.settings.fill, FillFromName(value));
+       return absl::OkStatus();
+     }},
+    {"--quality", "LEVEL", kMethod,
+     "fpbgi, adaptive clusters: the error to aim at: draft, normal (the default) or fine",
+     [](std::string_view value, JobEdit& edit) {
+       FP_ASSIGN_OR_RETURN(edit.spec.settings.quality, QualityFromName(value));
+       return absl::OkStatus();
+     }},
     {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.2",
      [](std::string_view value, JobEdit& edit) {
        double epsilon = 0;
@@ -476,13 +494,6 @@ constexpr RenderFlag kRenderFlags[] = {
      }},
 };
 
-constexpr RefusedFlag kRefusedFlags[] = {
-    {"--fill",
-     "filling cluster buffers by rays is not built yet; leave the flag out: the tree's "
-     "cut fills them"},
-    {"--quality", "quality levels are not built yet; set --points, --clusters and --microbuffer"},
-};
-
 std::string Lower(std::string_view text) {
   std::string lower(text);
   for (char& c : lower) c = c >= 'A' && c <= 'Z' ? static_cast<char>(c - 'A' + 'a') : c;
@@ -492,14 +503,8 @@ std::string Lower(std::string_view text) {
 }  // namespace
 
 std::span<const RenderFlag> RenderFlags() { return kRenderFlags; }
-std::span<const RefusedFlag> RefusedFlags() { return kRefusedFlags; }
 
 absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec) {
-  for (const auto& [name, value] : given) {
-    for (const RefusedFlag& flag : RefusedFlags()) {
-      if (name == flag.name) return Bad(name + ": " + std::string(flag.reason));
-    }
-  }
   JobEdit edit{.spec = spec};
   if (edit.spec.film.width == 0) {
     edit.spec.film = {kDefaultWidth, kDefaultHeight, {0, 0, kDefaultWidth, kDefaultHeight}};

@@ -43,13 +43,6 @@ struct RenderFlag {
 // --crop.
 std::span<const RenderFlag> RenderFlags();
 
-// Flags that the design names but that are not built yet. Each is refused whatever its value.
-struct RefusedFlag {
-  std::string_view name;
-  std::string_view reason;  // "… is not built yet; do this instead"
-};
-std::span<const RefusedFlag> RefusedFlags();
-
 // A flag as it was given; the value is "" for a flag without one.
 using GivenFlag = std::pair<std::string, std::string>;
 

@@ -507,6 +507,36 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
     default:
       return Bad(Path(field, "filter"), std::to_string(wire.filter()), "a value of PixelFilter");
   }
+  switch (wire.fill()) {
+    case v1::FILL_UNSPECIFIED:
+      break;
+    case v1::FILL_AUTO:
+      settings.fill = Fill::kAuto;
+      break;
+    case v1::FILL_RAYS:
+      settings.fill = Fill::kRays;
+      break;
+    case v1::FILL_CUT:
+      settings.fill = Fill::kCut;
+      break;
+    default:
+      return Bad(Path(field, "fill"), std::to_string(wire.fill()), "a value of Fill");
+  }
+  switch (wire.quality()) {
+    case v1::QUALITY_UNSPECIFIED:
+      break;
+    case v1::QUALITY_DRAFT:
+      settings.quality = Quality::kDraft;
+      break;
+    case v1::QUALITY_NORMAL:
+      settings.quality = Quality::kNormal;
+      break;
+    case v1::QUALITY_FINE:
+      settings.quality = Quality::kFine;
+      break;
+    default:
+      return Bad(Path(field, "quality"), std::to_string(wire.quality()), "a value of Quality");
+  }
   if (wire.has_filter_width_px()) settings.filter_width_px = wire.filter_width_px();
   if (wire.has_spp()) settings.spp = wire.spp();
   if (wire.has_paths()) settings.paths = wire.paths();
@@ -567,6 +597,28 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
       break;
     case PixelFilter::kBlackmanHarris:
       wire.set_filter(v1::PIXEL_FILTER_BLACKMAN_HARRIS);
+      break;
+  }
+  switch (settings.fill) {
+    case Fill::kAuto:
+      wire.set_fill(v1::FILL_AUTO);
+      break;
+    case Fill::kRays:
+      wire.set_fill(v1::FILL_RAYS);
+      break;
+    case Fill::kCut:
+      wire.set_fill(v1::FILL_CUT);
+      break;
+  }
+  switch (settings.quality) {
+    case Quality::kDraft:
+      wire.set_quality(v1::QUALITY_DRAFT);
+      break;
+    case Quality::kNormal:
+      wire.set_quality(v1::QUALITY_NORMAL);
+      break;
+    case Quality::kFine:
+      wire.set_quality(v1::QUALITY_FINE);
       break;
   }
   wire.set_filter_width_px(settings.filter_width_px);

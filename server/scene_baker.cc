@@ -128,6 +128,8 @@ Digest BakeKey(const JobSpec& spec) {
   s.buffer_map = any.buffer_map;
   s.splat = any.splat;
   s.clusters = any.clusters;
+  s.fill = any.fill;
+  s.quality = any.quality;
   s.epsilon = any.epsilon;
   s.normal_weight = any.normal_weight;
   s.kmeans_iterations = any.kmeans_iterations;

@@ -27,6 +27,11 @@ class CameraRays {
     const double u = half_height_ * (2.0 * x - width_) / height_;
     return Vec3f(Normalize(forward_ + right_ * u + up_ * v));
   }
+  // The side of a pixel at the depth of p, metres.
+  float FootprintAt(const Vec3f& p) const {
+    const double depth = Dot(Vec3d(p) - eye_, forward_);
+    return static_cast<float>((depth < 0 ? -depth : depth) * 2.0 * half_height_ / height_);
+  }
   // Distance along the camera's axis.
   float Depth(const Vec3f& p) const { return static_cast<float>(Dot(Vec3d(p) - eye_, forward_)); }
 

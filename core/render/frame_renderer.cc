@@ -13,15 +13,20 @@
 #include "core/pbgi/microbuffer.h"
 #include "core/pbgi/microbuffer_map.h"
 #include "core/pbgi/receiver_cluster.h"
+#include "core/pbgi/receiver_hierarchy.h"
 #include "core/pbgi/tree_cut.h"
 #include "core/render/camera_rays.h"
 #include "core/render/loaded_scene.h"
 #include "core/render/path_tracer.h"
 #include "core/render/pixel_filter.h"
+#include "core/render/record_gatherer.h"
 
 namespace farpoint {
 
 namespace {
+
+// Samples that records serve with less weight than this get their own.
+constexpr float kServed = 0.02f;
 
 // Keys of independent random choices.
 enum : uint64_t { kKeyPixel = 1, kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
@@ -66,7 +71,30 @@ struct Sample {
   uint32_t receiver = ~0u;  // index among the block's receivers
   Rgb direct_e, indirect_e, standard_error;
   float cluster = -1, cut_size = 0;
+  float weight = 0, heaviest = 0;  // of the records that serve it, adaptive clusters
 };
+
+// The parameters of adaptive clusters, measured in docs/decisions/0015-adaptive-clusters.md.
+HierarchyParams HierarchyOf(const RenderSettings& settings) {
+  HierarchyParams p;
+  p.seed = settings.seed;
+  switch (settings.quality) {
+    case Quality::kDraft:
+      p.coarsest_samples = 512;
+      p.reach = 0.25f;
+      p.enough = 0.1f;
+      p.floor_px = 6;
+      break;
+    case Quality::kNormal:
+      break;
+    case Quality::kFine:
+      p.coarsest_samples = 2048;
+      p.fall_off = 0.25f;
+      p.floor_px = 1;
+      break;
+  }
+  return p;
+}
 
 class Renderer final : public FrameRenderer {
  public:
@@ -77,7 +105,8 @@ class Renderer final : public FrameRenderer {
         settings_(frame.settings),
         rays_(frame.camera, frame.film, scene_.scene->origin()),
         map_(settings_.buffer_map, settings_.microbuffer_px()),
-        filter_(settings_.filter, settings_.filter_width()) {
+        filter_(settings_.filter, settings_.filter_width()),
+        ray_grid_(HierarchyOf(settings_).coarsest_samples) {
     cut_params_.epsilon = settings_.epsilon;
     cut_params_.map = settings_.buffer_map;
     cut_params_.pixel_sr = map_.reference_solid_angle();
@@ -88,8 +117,14 @@ class Renderer final : public FrameRenderer {
     wants_irradiance_ =
         wants(Layer::kIrradiance) || wants(Layer::kStdError) || wants(Layer::kCutSize);
     wants_direct_irradiance_ = wants(Layer::kDirectIrradiance);
+    wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
+    gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
+    if (settings_.adaptive()) {
+      hierarchy_ = std::make_unique<ReceiverHierarchy>(HierarchyOf(settings_), frame_.film.frame(),
+                                                       *gatherer_);
+    }
     wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
   }
 
@@ -107,15 +142,43 @@ class Renderer final : public FrameRenderer {
     std::atomic<bool> finite{true}, cancelled{false};
     std::mutex progress_mutex;
     int done = 0;
+    const int total = static_cast<int>(blocks.size()) * (hierarchy_ ? 2 : 1);
+    std::shared_ptr<const ReceiverHierarchy::View> view;
+    if (NeedsHierarchy()) {
+      int reported = 0;
+      const auto go_on = [&](double part) {
+        if (progress) {
+          const std::lock_guard lock(progress_mutex);
+          const int now = static_cast<int>(part * static_cast<double>(blocks.size()));
+          if (now > reported) progress(reported = now, total);
+        }
+        return cancel == nullptr || !cancel->load(std::memory_order_relaxed);
+      };
+      const double cpu = ProcessCpuSeconds();
+      ReceiverHierarchy::Counts counts;
+      view = hierarchy_->Prepare(tile, executor, go_on, counts);
+      Stats stats = gatherer_->TakeStats();
+      if (!view) return absl::CancelledError("the tile was cancelled");
+      // What is not gathering is choosing.
+      double gathering = 0;
+      for (const double s : stats.seconds) gathering += s;
+      stats.seconds[static_cast<int>(Stage::kCluster)] +=
+          std::max(0.0, ProcessCpuSeconds() - cpu - gathering);
+      stats.counts["clusters"] += counts.records;
+      stats.counts["cluster_candidates"] += counts.candidates;
+      stats.counts["cluster_samples"] += counts.samples;
+      out.stats += stats;
+    }
+    if (hierarchy_) done = static_cast<int>(blocks.size());
     executor.ForEach(blocks.size(), 1, [&](size_t i) {
       if (cancel != nullptr && cancel->load(std::memory_order_relaxed)) {
         cancelled = true;
         return;
       }
-      if (!RenderBlock(blocks[i], tile, out.film, block_stats[i])) finite = false;
+      if (!RenderBlock(blocks[i], tile, view.get(), out.film, block_stats[i])) finite = false;
       if (progress) {
         const std::lock_guard lock(progress_mutex);
-        progress(++done, static_cast<int>(blocks.size()));
+        progress(++done, total);
       }
     });
     if (cancelled) return absl::CancelledError("the tile was cancelled");
@@ -138,7 +201,8 @@ class Renderer final : public FrameRenderer {
 
  private:
   // False if a value is not finite.
-  bool RenderBlock(const PixelRect& block, const PixelRect& tile, Film& film, Stats& stats) const {
+  bool RenderBlock(const PixelRect& block, const PixelRect& tile,
+                   const ReceiverHierarchy::View* view, Film& film, Stats& stats) const {
     StageClock clock;
     Counters n;
     const uint32_t spp = settings_.spp;
@@ -179,8 +243,12 @@ class Renderer final : public FrameRenderer {
       if (settings_.integrator == Integrator::kPt) {
         TracePaths(block, samples, receivers, sample_of, wanted, n);
         clock.Charge(Stage::kTrace);
+      } else if (view != nullptr) {
+        Blend(*view, block, samples, receivers, sample_of, wanted, n, stats);
+        clock.Charge(Stage::kConvolve);
       } else {
         Gather(block, samples, receivers, sample_of, wanted, n, clock);
+        stats += gatherer_->TakeStats();
       }
     }
 
@@ -224,15 +292,7 @@ class Renderer final : public FrameRenderer {
           sample.albedo = surface.albedo;
           sample.emission = surface.emission;
           sample.receiver = static_cast<uint32_t>(receivers.size());
-          Receiver r;
-          r.position = scene.PointOn(hit->triangle, hit->b1, hit->b2);
-          r.geometric_normal = scene.GeometricNormal(hit->triangle);
-          r.normal = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
-          r.on_back = Dot(r.geometric_normal, w) > 0.0f;
-          if (r.on_back) {
-            r.geometric_normal = -r.geometric_normal;
-            r.normal = -r.normal;
-          }
+          const Receiver r = ReceiverOfHit(scene, *hit, w);
           sample.depth = rays_.Depth(r.position);
           receivers.push_back(r);
           sample_of.push_back(static_cast<uint32_t>(at));
@@ -292,6 +352,95 @@ class Renderer final : public FrameRenderer {
     n.skipped_shadow += counters.skipped_facing_away;
   }
 
+  // Without light there is nothing to gather.
+  bool NeedsHierarchy() const {
+    return hierarchy_ != nullptr && wants_indirect_ &&
+           (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
+  }
+
+  // Adaptive clusters: receivers blend the records about them.
+  void Blend(const ReceiverHierarchy::View& view, const PixelRect& block,
+             std::vector<Sample>& samples, const std::vector<Receiver>& receivers,
+             const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
+             Counters& n, Stats& stats) const {
+    constexpr int kSide = 8;
+    constexpr int kAcross = kBlockSize / kSide;
+    const uint32_t spp = settings_.spp;
+    std::array<std::vector<uint32_t>, kAcross * kAcross> groups;
+    for (uint32_t r = 0; r < receivers.size(); ++r) {
+      if (!wanted[r]) continue;
+      const int pixel = static_cast<int>(sample_of[r] / spp);
+      groups[static_cast<size_t>(pixel / block.width() / kSide * kAcross +
+                                 pixel % block.width() / kSide)]
+          .push_back(r);
+    }
+    std::vector<const ScreenRecord*> records;
+    for (size_t g = 0; g < groups.size(); ++g) {
+      if (groups[g].empty()) continue;
+      const int x0 = block.x0 + static_cast<int>(g) % kAcross * kSide;
+      const int y0 = block.y0 + static_cast<int>(g) / kAcross * kSide;
+      records.clear();
+      view.Collect({x0, y0, x0 + kSide, y0 + kSide}, records);
+      for (size_t at = 0; at < groups[g].size(); at += 8) {
+        const size_t count = std::min<size_t>(8, groups[g].size() - at);
+        ServedReceiver served[8];
+        Rgb e[8];
+        float weight[8];
+        for (size_t i = 0; i < count; ++i) {
+          const uint32_t r = groups[g][at + i];
+          const int pixel = static_cast<int>(sample_of[r] / spp);
+          served[i] = {&receivers[r], static_cast<float>(block.x0 + pixel % block.width()) + 0.5f,
+                       static_cast<float>(block.y0 + pixel / block.width()) + 0.5f};
+        }
+        BlendRecords(records, {served, count}, {e, count}, {weight, count});
+        for (size_t i = 0; i < count; ++i) {
+          Sample& sample = samples[sample_of[groups[g][at + i]]];
+          sample.indirect_e = e[i];
+          sample.weight = weight[i];
+          if (!wants_cluster_) continue;
+          for (const ScreenRecord* record : records) {
+            Rgb alone;
+            float share;
+            BlendRecords({&record, 1}, {&served[i], 1}, {&alone, 1}, {&share, 1});
+            if (!(share > 0.0f)) continue;
+            ++sample.cut_size;
+            if (share > sample.heaviest) {
+              sample.heaviest = share;
+              sample.cluster = (record->y_px - 0.5f) * static_cast<float>(frame_.film.width) +
+                               (record->x_px - 0.5f);
+            }
+          }
+        }
+      }
+    }
+    // Samples beside a pixel's centre may lie on a surface that no candidate saw. Those of a pixel
+    // share what they make.
+    std::vector<ScreenRecord> own;
+    std::vector<const ScreenRecord*> own_list;
+    for (uint32_t r = 0; r < receivers.size() && spp > 1; ++r) {
+      if (r == 0 || sample_of[r] / spp != sample_of[r - 1] / spp) {
+        own.clear();
+        own.reserve(spp);
+        own_list.clear();
+      }
+      Sample& sample = samples[sample_of[r]];
+      if (!wanted[r] || sample.weight >= kServed) continue;
+      const int pixel = static_cast<int>(sample_of[r] / spp);
+      const int x = block.x0 + pixel % block.width(), y = block.y0 + pixel / block.width();
+      const ServedReceiver served{&receivers[r], static_cast<float>(x) + 0.5f,
+                                  static_cast<float>(y) + 0.5f};
+      BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1});
+      if (sample.weight >= hierarchy_->params().enough) continue;
+      own.push_back(hierarchy_->MakeOwnRecord(
+          served, rays_.FootprintAt(receivers[r].position),
+          HashKey(static_cast<uint64_t>(x), static_cast<uint64_t>(y), sample_of[r] % spp)));
+      own_list.push_back(&own.back());
+      sample.indirect_e = own.back().gather.irradiance;
+      ++n.clusters;
+    }
+    stats += gatherer_->TakeStats();
+  }
+
   void Gather(const PixelRect& block, std::vector<Sample>& samples,
               const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
               const std::vector<uint8_t>& wanted, Counters& n, StageClock& clock) const {
@@ -303,7 +452,7 @@ class Renderer final : public FrameRenderer {
     std::vector<ReceiverCluster> clusters;
     if (settings_.integrator == Integrator::kFpbgi) {
       ClusterParams params;
-      params.k = settings_.clusters_per_block();
+      params.k = settings_.clusters;
       params.iterations = settings_.kmeans_iterations;
       params.normal_weight = settings_.normal_weight;
       params.seed_key =
@@ -325,6 +474,8 @@ class Renderer final : public FrameRenderer {
       }
     }
 
+    const bool by_rays =
+        settings_.integrator == Integrator::kFpbgi && settings_.fill_in_force() == Fill::kRays;
     Microbuffer far_buffer(map_), near_buffer(map_);
     std::vector<CutNode> cut, scratch;
     std::vector<NearNode> near;
@@ -337,6 +488,19 @@ class Renderer final : public FrameRenderer {
                                    [&](uint32_t r) { return wanted[r] != 0; });
       if (!any) continue;
       ++n.clusters;
+      if (by_rays) {
+        const GatherRecord record =
+            gatherer_->Gather(receivers[cluster.active], ray_grid_,
+                              HashKey(PixelKey(block, sample_of[cluster.active], kKeyCluster),
+                                      sample_of[cluster.active] % settings_.spp));
+        for (const uint32_t r : cluster.members) {
+          if (!wanted[r]) continue;
+          Sample& sample = samples[sample_of[r]];
+          sample.cluster = static_cast<float>(c);
+          sample.indirect_e = IrradianceAt(record, receivers[r].position, receivers[r].normal);
+        }
+        continue;
+      }
       // Cluster cut and microbuffer (paper §3.2). Where there is nothing to share, all is far.
       const bool alone = cluster.members.size() == 1;
       CutView view;
@@ -532,7 +696,11 @@ class Renderer final : public FrameRenderer {
   CameraRays rays_;
   MicrobufferMap map_;
   PixelFilterSampler filter_;
+  HemisphereGrid ray_grid_;  // of k clusters per block filled by rays
   CutParams cut_params_;
+  std::unique_ptr<RecordGatherer> gatherer_;
+  std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
+  bool wants_cluster_;
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
 };
 

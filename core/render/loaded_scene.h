@@ -2,10 +2,12 @@
 #pragma once
 
 #include <memory>
+#include <mutex>
 
 #include "core/accel/ray_accel.h"
 #include "core/light/light_sampler.h"
 #include "core/pbgi/point_tree.h"
+#include "core/pbgi/surfel_atlas.h"
 #include "core/render/frame_renderer.h"
 
 namespace farpoint {
@@ -16,6 +18,16 @@ class LoadedSceneData final : public LoadedScene {
   std::shared_ptr<const RayAccel> accel;
   std::unique_ptr<const LightSampler> lights;
   std::shared_ptr<const PointTree> tree;  // null if the blobs have none
+
+  // Made when it is first asked for; `tree` must be there.
+  const SurfelAtlas& Atlas() const {
+    std::call_once(atlas_once_, [this] { atlas_ = std::make_unique<SurfelAtlas>(*scene, *tree); });
+    return *atlas_;
+  }
+
+ private:
+  mutable std::once_flag atlas_once_;
+  mutable std::unique_ptr<const SurfelAtlas> atlas_;
 };
 
 }  // namespace farpoint

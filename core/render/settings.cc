@@ -11,12 +11,13 @@ namespace {
 
 constexpr uint32_t kDefaultMicrobuffer = 32;
 constexpr uint32_t kDefaultDegradedMicrobuffer = 16;
-constexpr uint32_t kDefaultClusters = 64;
 
 constexpr std::array<std::string_view, 4> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt"};
 
 constexpr std::array<std::string_view, 4> kFilterNames = {"box", "triangle", "gaussian",
                                                           "blackman-harris"};
+constexpr std::array<std::string_view, 3> kFillNames = {"auto", "rays", "cut"};
+constexpr std::array<std::string_view, 3> kQualityNames = {"draft", "normal", "fine"};
 constexpr std::array<float, 4> kFilterWidths = {1.0f, 2.0f, 3.0f, 3.0f};
 
 template <typename T>
@@ -34,8 +35,9 @@ uint32_t RenderSettings::microbuffer_px() const {
   return integrator == Integrator::kDpbgi ? kDefaultDegradedMicrobuffer : kDefaultMicrobuffer;
 }
 
-uint32_t RenderSettings::clusters_per_block() const {
-  return clusters != 0 ? clusters : kDefaultClusters;
+Fill RenderSettings::fill_in_force() const {
+  if (fill != Fill::kAuto) return fill;
+  return adaptive() ? Fill::kRays : Fill::kCut;
 }
 
 float RenderSettings::filter_width() const {
@@ -72,10 +74,16 @@ absl::Status ValidateSettings(const RenderSettings& s) {
   if (s.splat != Splat::kCoverage && s.splat != Splat::kOpaque) {
     return absl::InvalidArgumentError("splat: unknown value; use coverage or opaque");
   }
-  if (s.integrator == Integrator::kFpbgi && s.buffer_map == BufferMap::kCosine) {
+  if (s.integrator == Integrator::kFpbgi && s.clusters != 0 && s.buffer_map == BufferMap::kCosine) {
     return absl::InvalidArgumentError(
-        "buffer-map cosine is the hemisphere of one receiver and cannot be shared by a cluster; "
-        "use octahedral with fpbgi, or pbgi with cosine");
+        "buffer-map cosine is the hemisphere of one receiver and cannot be shared by one of k "
+        "clusters; use octahedral, adaptive clusters, or pbgi");
+  }
+  if (static_cast<uint32_t>(s.fill) >= kFillNames.size()) {
+    return absl::InvalidArgumentError("fill: unknown value; use auto, rays or cut");
+  }
+  if (static_cast<uint32_t>(s.quality) >= kQualityNames.size()) {
+    return absl::InvalidArgumentError("quality: unknown value; use draft, normal or fine");
   }
   if (s.tile_px == 0 || s.tile_px % kBlockSize != 0 || s.tile_px > 65536) {
     return absl::InvalidArgumentError("tile is " + std::to_string(s.tile_px) +
@@ -105,6 +113,7 @@ void ApplyPaperPreset(RenderSettings& s) {
   s.buffer_map = BufferMap::kOctahedral;
   s.splat = Splat::kOpaque;
   s.clusters = 100;
+  s.fill = Fill::kCut;
   s.epsilon = 0.1f;
   s.normal_weight = 1.0f;
   s.kmeans_iterations = 5;
@@ -132,5 +141,25 @@ absl::StatusOr<PixelFilter> PixelFilterFromName(std::string_view name) {
 }
 
 std::string_view NameOf(PixelFilter filter) { return kFilterNames[static_cast<size_t>(filter)]; }
+
+absl::StatusOr<Fill> FillFromName(std::string_view name) {
+  for (size_t i = 0; i < kFillNames.size(); ++i) {
+    if (kFillNames[i] == name) return static_cast<Fill>(i);
+  }
+  return absl::InvalidArgumentError("unknown fill '" + std::string(name) +
+                                    "'; use auto, rays or cut");
+}
+
+std::string_view NameOf(Fill fill) { return kFillNames[static_cast<size_t>(fill)]; }
+
+absl::StatusOr<Quality> QualityFromName(std::string_view name) {
+  for (size_t i = 0; i < kQualityNames.size(); ++i) {
+    if (kQualityNames[i] == name) return static_cast<Quality>(i);
+  }
+  return absl::InvalidArgumentError("unknown quality '" + std::string(name) +
+                                    "'; use draft, normal or fine");
+}
+
+std::string_view NameOf(Quality quality) { return kQualityNames[static_cast<size_t>(quality)]; }
 
 }  // namespace farpoint

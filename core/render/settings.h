@@ -23,6 +23,15 @@ enum class Integrator : uint32_t {
 // belongs to one pixel and a tile needs nothing of its neighbours.
 enum class PixelFilter : uint32_t { kBox, kTriangle, kGaussian, kBlackmanHarris };
 
+// What fills the buffer that a cluster shares.
+enum class Fill : uint32_t {
+  kAuto,  // rays for adaptive clusters, cuts for k per block: the best of each
+  kRays,  // rays, which bring back the radiance of the nearest surfel
+  kCut,   // a cut of the point tree, rasterized (the paper)
+};
+// The error that adaptive clusters aim at: how many, and how finely sampled.
+enum class Quality : uint32_t { kDraft, kNormal, kFine };
+
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
@@ -35,10 +44,12 @@ struct RenderSettings {
   uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default
   BufferMap buffer_map = BufferMap::kOctahedral;
   Splat splat = Splat::kCoverage;
-  uint32_t clusters = 0;           // k per block, 1..1024; 0: the default
-  float epsilon = 0.2f;            // far: R_cluster < epsilon (d - r); >= 0
-  float normal_weight = 1.0f;      // alpha / squared block diagonal (paper §3.1)
-  uint32_t kmeans_iterations = 5;  // 0..100
+  uint32_t clusters = 0;               // fpbgi: k per block, 1..1024; 0: adaptive, see Quality
+  Fill fill = Fill::kAuto;             // fpbgi: what fills a cluster's buffer
+  Quality quality = Quality::kNormal;  // fpbgi with adaptive clusters
+  float epsilon = 0.2f;                // far: R_cluster < epsilon (d - r); >= 0
+  float normal_weight = 1.0f;          // alpha / squared block diagonal (paper §3.1)
+  uint32_t kmeans_iterations = 5;      // 0..100
   uint64_t seed = 0;
   std::vector<Layer> layers = DefaultLayers();
 
@@ -48,7 +59,8 @@ struct RenderSettings {
 
   // The value in force where 0 means "default".
   uint32_t microbuffer_px() const;
-  uint32_t clusters_per_block() const;
+  bool adaptive() const { return integrator == Integrator::kFpbgi && clusters == 0; }
+  Fill fill_in_force() const;
   float filter_width() const;  // pixels
 };
 
@@ -65,5 +77,10 @@ std::string_view NameOf(Integrator integrator);
 
 absl::StatusOr<PixelFilter> PixelFilterFromName(std::string_view name);
 std::string_view NameOf(PixelFilter filter);
+
+absl::StatusOr<Fill> FillFromName(std::string_view name);
+std::string_view NameOf(Fill fill);
+absl::StatusOr<Quality> QualityFromName(std::string_view name);
+std::string_view NameOf(Quality quality);
 
 }  // namespace farpoint

@@ -16,7 +16,22 @@ RenderSettings Small(Integrator integrator) {
   return s;
 }
 
-class FrameOf : public testing::TestWithParam<Integrator> {};
+// An integrator in one of its ways.
+struct Way {
+  const char* name;
+  Integrator integrator;
+  uint32_t clusters = 12;  // 0: adaptive
+  Fill fill = Fill::kAuto;
+};
+RenderSettings Small(const Way& way) {
+  RenderSettings s = Small(way.integrator);
+  s.clusters = way.clusters;
+  s.fill = way.fill;
+  s.quality = Quality::kDraft;
+  return s;
+}
+
+class FrameOf : public testing::TestWithParam<Way> {};
 
 TEST_P(FrameOf, IsIndependentOfThreadsTilesOrderAndCrops) {
   const Scene scene = MakeCornellBox();
@@ -93,10 +108,15 @@ TEST_P(FrameOf, SeveralSamplesPerPixelAverage) {
   EXPECT_LT(std::fabs(Compare(four, one, Layer::kIrradiance).bias), 0.08);
 }
 
-INSTANTIATE_TEST_SUITE_P(Integrators, FrameOf,
-                         testing::Values(Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
-                                         Integrator::kPt),
-                         [](const auto& info) { return std::string(NameOf(info.param)); });
+INSTANTIATE_TEST_SUITE_P(
+    Integrators, FrameOf,
+    testing::Values(Way{"fpbgi_adaptive_rays", Integrator::kFpbgi, 0},
+                    Way{"fpbgi_adaptive_cut", Integrator::kFpbgi, 0, Fill::kCut},
+                    Way{"fpbgi_k_cut", Integrator::kFpbgi},
+                    Way{"fpbgi_k_rays", Integrator::kFpbgi, 12, Fill::kRays},
+                    Way{"pbgi", Integrator::kPbgi}, Way{"dpbgi", Integrator::kDpbgi},
+                    Way{"pt", Integrator::kPt}),
+    [](const auto& info) { return std::string(info.param.name); });
 
 TEST(Frame, BeautyIsTheSumOfItsLayers) {
   const Scene scene = MakeCornellBox();
@@ -125,6 +145,11 @@ TEST(Frame, WithoutLightIsBlackAndCostsNoGather) {
   }
   EXPECT_GT(r.stats.skipped.at("unlit_receivers"), 0u);
   EXPECT_EQ(r.stats.counts.at("clusters"), 0u);
+  RenderSettings adaptive = Small(Integrator::kFpbgi);
+  adaptive.clusters = 0;
+  const Rendered a = RenderScene(scene, scene.cameras[0], Whole(32, 32), adaptive);
+  EXPECT_EQ(ImageHash(a.film), ImageHash(r.film));
+  EXPECT_EQ(a.stats.counts.at("clusters"), 0u);
 }
 
 TEST(Frame, BackgroundOnlyBlocksCostNothing) {

@@ -255,13 +255,6 @@ TEST(CommandLine, NamesTheNearestCommandAndFlag) {
   EXPECT_THAT(Refusal({"status", "--spp", "4"}), HasSubstr("unknown flag of farpoint status"));
 }
 
-TEST(CommandLine, RefusesWhatIsNotBuiltYet) {
-  for (const char* flag : {"--fill", "--quality"}) {
-    EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", flag, "x"}),
-                AllOf(StartsWith(flag), HasSubstr("not built yet")));
-  }
-}
-
 TEST(CommandLine, SaysWhatAValueIsMissingFor) {
   EXPECT_THAT(Refusal({"render", "a.glb", "-o"}), StartsWith("-o: needs a value"));
   EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--spp"}),
@@ -317,7 +310,7 @@ TEST_F(ConfigFile, NamesFileLineAndNearestName) {
 
 TEST_F(ConfigFile, RefusesWhatIsNoSetting) {
   for (const char* text : {"spp\n", "no-skip = yes\n", "config = other\n", "help = true\n",
-                           "[render]\n", "fill = cut\n", "spp =\n", "spp = \"\"\n"}) {
+                           "[render]\n", "filling = cut\n", "spp =\n", "spp = \"\"\n"}) {
     const std::string path = Write(text);
     EXPECT_THAT(Refusal({"render", "a.glb", "-o", "o.exr", "--config", path}),
                 StartsWith(path + ":1: "))

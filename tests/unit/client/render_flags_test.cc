@@ -36,14 +36,13 @@ TEST(RenderFlags, DefaultsAreThoseOfTheSettings) {
   EXPECT_TRUE(std::holds_alternative<std::monostate>(spec.camera));
 }
 
-TEST(RenderFlags, NamesAreUniqueAndNotAlsoRefused) {
+TEST(RenderFlags, NamesAreUniqueAndExplained) {
   std::set<std::string_view> names;
   for (const RenderFlag& flag : RenderFlags()) {
     EXPECT_TRUE(names.insert(flag.name).second) << flag.name;
     EXPECT_THAT(std::string(flag.name), StartsWith("--"));
     EXPECT_FALSE(flag.help.empty()) << flag.name;
   }
-  for (const RefusedFlag& flag : RefusedFlags()) EXPECT_EQ(names.count(flag.name), 0u);
 }
 
 TEST(RenderFlags, SetFilterAndFrames) {
@@ -226,6 +225,7 @@ TEST(RenderFlags, OverrideTheJobFile) {
 TEST(RenderFlags, ALaterFlagMayHealAnEarlierOne) {
   JobSpec spec;
   spec.settings.integrator = Integrator::kPbgi;
+  spec.settings.clusters = 64;
   spec.settings.buffer_map = BufferMap::kCosine;
   EXPECT_EQ(
       Apply({{"--integrator", "fpbgi"}, {"--buffer-map", "octahedral"}}, spec).settings.integrator,
@@ -272,10 +272,10 @@ INSTANTIATE_TEST_SUITE_P(
         BadValue{"--spp", "4294967297", "whole number"}, BadValue{"--paths", "0", "paths"},
         BadValue{"--light-samples", "5000", "light-samples"},
         BadValue{"--points", "2147483649", "points"}, BadValue{"--microbuffer", "257", ""},
-        BadValue{"--buffer-map", "cosine", "fpbgi"},
         BadValue{"--buffer-map", "cosin", "did you mean 'cosine'?"},
         BadValue{"--splat", "both", "coverage, opaque"},
-        BadValue{"--clusters", "adaptive", "not built yet"}, BadValue{"--clusters", "0", "1..1024"},
+        BadValue{"--fill", "x", "auto, rays or cut"}, BadValue{"--quality", "x", "draft, normal"},
+        BadValue{"--clusters", "adapt", "adaptive"}, BadValue{"--clusters", "0", "1..1024"},
         BadValue{"--clusters", "1025", "clusters"}, BadValue{"--epsilon", "-0.1", "at least 0"},
         BadValue{"--epsilon", "nan", "finite"}, BadValue{"--epsilon", "inf", "finite"},
         BadValue{"--bounces", "2", "one bounce"}, BadValue{"--bounces", "0", "one bounce"},
@@ -302,10 +302,14 @@ TEST(RenderFlagsRefuse, PartsOfACameraThatMakeNoCamera) {
   EXPECT_THAT(Refusal({{"--eye", "0,5,0"}, {"--target", "0,0,0"}}), HasSubstr("parallel"));
 }
 
-TEST(RenderFlagsRefuse, WhatIsNotBuiltYet) {
-  for (const char* flag : {"--fill", "--quality"}) {
-    EXPECT_THAT(Refusal({{flag, "x"}}), AllOf(StartsWith(flag), HasSubstr("not built yet")));
-  }
+TEST(RenderFlags, SetClustersFillAndQuality) {
+  RenderSettings s = Apply({{"--clusters", "9"}, {"--fill", "rays"}}).settings;
+  EXPECT_EQ(s.clusters, 9u);
+  EXPECT_EQ(s.fill, Fill::kRays);
+  s = Apply({{"--clusters", "adaptive"}, {"--fill", "cut"}, {"--quality", "fine"}}).settings;
+  EXPECT_TRUE(s.adaptive());
+  EXPECT_EQ(s.fill, Fill::kCut);
+  EXPECT_EQ(s.quality, Quality::kFine);
 }
 
 TEST(CheckScenePath, KnowsItsExtensions) {

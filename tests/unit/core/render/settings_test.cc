@@ -128,11 +128,15 @@ TEST(RenderSettings, UnknownEnumeratorsAreRefused) {
   ExpectRefused(Validated([](RenderSettings& s) { s.layers.clear(); }), {"aov", "no layer"});
 }
 
+// The hemisphere of one receiver: enough for a record, which is one receiver's, but not for k
+// clusters, whose members share a buffer.
 TEST(RenderSettings, AClusterCannotShareACosineBuffer) {
+  EXPECT_TRUE(Validated([](RenderSettings& s) { s.buffer_map = BufferMap::kCosine; }).ok());
   for (const Integrator integrator :
        {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
     const absl::Status status = Validated([&](RenderSettings& s) {
       s.integrator = integrator;
+      s.clusters = 64;
       s.buffer_map = BufferMap::kCosine;
     });
     if (integrator == Integrator::kFpbgi) {
@@ -191,7 +195,8 @@ TEST(RenderSettings, NamesAndIntegratorsMatch) {
 TEST(RenderSettings, ZeroMeansTheDefaultInForce) {
   RenderSettings s;
   EXPECT_EQ(s.microbuffer_px(), 32u);
-  EXPECT_GE(s.clusters_per_block(), 1u);
+  EXPECT_TRUE(s.adaptive());
+  EXPECT_EQ(s.fill_in_force(), Fill::kRays);
   // dpbgi is pbgi with a smaller buffer.
   s.integrator = Integrator::kPbgi;
   const uint32_t full = s.microbuffer_px();
@@ -201,7 +206,23 @@ TEST(RenderSettings, ZeroMeansTheDefaultInForce) {
   s.microbuffer = 77;
   s.clusters = 5;
   EXPECT_EQ(s.microbuffer_px(), 77u);
-  EXPECT_EQ(s.clusters_per_block(), 5u);
+  s.integrator = Integrator::kFpbgi;
+  EXPECT_FALSE(s.adaptive());
+  EXPECT_EQ(s.fill_in_force(), Fill::kCut);
+  s.fill = Fill::kRays;
+  EXPECT_EQ(s.fill_in_force(), Fill::kRays);
+}
+
+TEST(RenderSettings, FillsAndQualitiesHaveNames) {
+  for (const char* name : {"auto", "rays", "cut"}) EXPECT_EQ(NameOf(*FillFromName(name)), name);
+  for (const char* name : {"draft", "normal", "fine"}) {
+    EXPECT_EQ(NameOf(*QualityFromName(name)), name);
+  }
+  ExpectRefused(FillFromName("points").status(), {"points", "auto, rays or cut"});
+  ExpectRefused(QualityFromName("best").status(), {"best", "draft, normal or fine"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.fill = static_cast<Fill>(3); }), {"fill"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.quality = static_cast<Quality>(3); }),
+                {"quality"});
 }
 
 TEST(RenderSettings, PaperPresetIsThePapers) {
@@ -212,7 +233,8 @@ TEST(RenderSettings, PaperPresetIsThePapers) {
   s.points = 1234;
   s.buffer_map = BufferMap::kCosine;
   ApplyPaperPreset(s);
-  EXPECT_EQ(s.clusters_per_block(), 100u);
+  EXPECT_EQ(s.clusters, 100u);
+  EXPECT_EQ(s.fill_in_force(), Fill::kCut);
   EXPECT_EQ(s.epsilon, 0.1f);
   EXPECT_EQ(s.splat, Splat::kOpaque);
   EXPECT_EQ(s.normal_weight, 1.0f);

@@ -1,0 +1,143 @@
+// A hierarchy of receivers over the image, coarse to fine: where shared gathers are made and how
+// receivers blend them. It stands in for the paper's k clusters per block (§3.1) and is what its
+// §5 names as future work: clusters follow the scene's complexity, not the number of pixels.
+//
+// Level l has a grid of cells of s_l = coarsest / 2^l pixels over the frame, down to 1. Each cell
+// has one candidate pixel, jittered within the cell by the cell's coordinates. A candidate becomes
+// a cluster's active receiver, and its record is gathered, where the summed weight of all records
+// of coarser levels is below `enough`. A record of level l weighs only within kScreenReach s_l
+// pixels, so what a record is depends on its own pixel and on coarser records near it: never on
+// tiles, threads or order. The finest level's candidates are the pixels themselves, so every
+// receiver at a pixel's centre is served.
+//
+// The weight of record k at a receiver x with normal n, at point p of the image:
+//   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / a - sqrt((1 - n·n_c) / kNormalTolerance))²
+//       · max(0, 1 - |p - p_c|² / ρ²)²,   ρ = kScreenReach s_l,
+// continuous and of compact support in all of its arguments. The reach a is `reach` times the
+// harmonic mean distance of what the record saw, at most E / (2 |∇E|), at most a coarser
+// neighbour's reach plus the distance to it, at least `floor_px` pixels' footprints (then the
+// gradient is reduced in proportion).
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <span>
+#include <unordered_map>
+#include <vector>
+
+#include "core/base/executor.h"
+#include "core/image/tile_rect.h"
+#include "core/pbgi/gather_record.h"
+#include "core/pbgi/receiver_cluster.h"
+
+namespace farpoint {
+
+inline constexpr float kScreenReach = 1.5f;      // of a record, in spacings of its level
+inline constexpr float kNormalTolerance = 0.3f;  // 1 - cos of the angle at which weights end (46°)
+
+struct HierarchyParams {
+  uint32_t coarsest_px = 16;         // spacing of level 0; a power of two
+  uint32_t coarsest_samples = 1024;  // strata of a record of level 0; those of level l are
+  float fall_off = 0.5f;             // (s_l / s_0)^fall_off times as many, at least
+  uint32_t least_samples = 64;
+  float reach = 0.15f;  // a over the harmonic mean distance
+  float enough = 0.2f;  // summed weight that spares a receiver a record of its own
+  float floor_px = 4;   // least a, in pixels' footprints
+  uint64_t seed = 0;
+};
+
+// What the hierarchy needs of a renderer. Thread-safe.
+class RecordSource {
+ public:
+  virtual ~RecordSource() = default;
+  // The receiver at the centre of pixel (x, y) and the side of a pixel at its depth. False:
+  // background.
+  virtual bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const = 0;
+  // All but reach_m; a function of its arguments.
+  virtual GatherRecord Gather(const Receiver& receiver, const HemisphereGrid& grid,
+                              uint64_t key) const = 0;
+};
+
+struct ScreenRecord {
+  GatherRecord gather;
+  float x_px = 0, y_px = 0;  // of the active receiver
+  float screen_reach_px = 0;
+};
+
+// A receiver to be served.
+struct ServedReceiver {
+  const Receiver* receiver;
+  float x_px, y_px;  // in the image
+};
+
+// Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs. What a
+// receiver gets depends on the records that weigh on it and on their order, not on the other
+// receivers.
+void BlendRecords(std::span<const ScreenRecord* const> records,
+                  std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
+                  std::span<float> weight);
+
+class ReceiverHierarchy {
+ public:
+  // `source` must outlive the hierarchy.
+  ReceiverHierarchy(const HierarchyParams& params, const PixelRect& frame,
+                    const RecordSource& source);
+
+  // The records that can weigh on receivers within a rectangle.
+  class View {
+   public:
+    // Appends the records that can weigh on something within `rect`, always in the same order.
+    void Collect(const PixelRect& rect, std::vector<const ScreenRecord*>& out) const;
+
+   private:
+    friend class ReceiverHierarchy;
+    struct Grid {
+      int spacing, x0, y0, columns, rows;  // in cells
+      std::vector<std::shared_ptr<const ScreenRecord>> records;
+    };
+    std::vector<Grid> grids_;  // by level
+  };
+
+  struct Counts {
+    uint64_t candidates = 0;  // pixels looked at
+    uint64_t records = 0;     // gathers made
+    uint64_t samples = 0;     // their strata
+  };
+
+  // Makes the records that are missing and adds to `counts` what it took; those of earlier calls
+  // are kept (up to kKeptRecords). `go_on` (may be empty) is called after each gather, from any
+  // thread, with the part of the work that is done, [0, 1]; when it says false the result is null.
+  // Thread-safe.
+  std::shared_ptr<const View> Prepare(const PixelRect& rect, Executor& executor,
+                                      const std::function<bool(double)>& go_on,
+                                      Counts& counts) const;
+
+  // A record for a receiver that the view serves badly (it lies beside the pixel's centre, on
+  // another surface), with the finest level's strata and reach. `key` tells it from others.
+  ScreenRecord MakeOwnRecord(const ServedReceiver& receiver, float footprint_m, uint64_t key) const;
+
+  const HierarchyParams& params() const { return params_; }
+
+  static constexpr size_t kKeptRecords = size_t{1} << 21;
+
+ private:
+  struct Level {
+    Level(int spacing_px, uint32_t samples) : spacing(spacing_px), grid(samples) {}
+    const int spacing;
+    const HemisphereGrid grid;
+    std::mutex mutex;
+    std::unordered_map<uint64_t, std::shared_ptr<const ScreenRecord>> records;  // by cell
+  };
+
+  void SetReach(float footprint_m, float most_reach_m, ScreenRecord& record) const;
+
+  const HierarchyParams params_;
+  const PixelRect frame_;
+  const RecordSource& source_;
+  std::vector<std::unique_ptr<Level>> levels_;
+};
+
+}  // namespace farpoint

@@ -1,0 +1,232 @@
+#include "core/pbgi/surfel_atlas.h"
+
+#include <algorithm>
+#include <atomic>
+#include <bit>
+#include <cmath>
+#include <cstdlib>
+
+#include "core/math/sampling.h"
+
+namespace farpoint {
+
+namespace {
+
+constexpr float kSameSurfaceCosine = 0.5f;
+
+uint64_t KeyOf(int64_t x, int64_t y, int64_t z) {
+  return static_cast<uint64_t>(x) << 42 | static_cast<uint64_t>(y) << 21 | static_cast<uint64_t>(z);
+}
+
+}  // namespace
+
+SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
+  if (tree.empty()) return;
+  const uint64_t n = tree.surfel_count();
+  const uint32_t first = tree.first_group(0);
+  double area = 0;
+  Box3f box;
+  for (uint64_t i = 0; i < n; ++i) {
+    const NodeGroup& g = tree.group(first + static_cast<uint32_t>(i / kLanes));
+    const unsigned k = i % kLanes;
+    area += static_cast<double>(g.area[k]);
+    box.Extend({g.cx[k], g.cy[k], g.cz[k]});
+  }
+  spacing_m_ = static_cast<float>(std::sqrt(area / static_cast<double>(n)));
+  // At most 2^20 cells along an axis, so that keys fit.
+  const float cell = std::max(2.0f * spacing_m_, MaxAbs(box.max - box.min) * (1.0f / 1000000.0f));
+  inverse_cell_ = 1.0f / cell;
+  low_ = box.min - Vec3f(cell);
+  struct Keyed {
+    uint64_t key;
+    uint32_t slot;
+    bool operator<(const Keyed& o) const { return key != o.key ? key < o.key : slot < o.slot; }
+  };
+  std::vector<Keyed> order(n);
+  for (uint64_t i = 0; i < n; ++i) {
+    const NodeGroup& g = tree.group(first + static_cast<uint32_t>(i / kLanes));
+    const unsigned k = i % kLanes;
+    const Vec3f q = (Vec3f(g.cx[k], g.cy[k], g.cz[k]) - low_) * inverse_cell_;
+    order[i] = {
+        KeyOf(static_cast<int64_t>(q.x), static_cast<int64_t>(q.y), static_cast<int64_t>(q.z)),
+        static_cast<uint32_t>(i)};
+  }
+  std::sort(order.begin(), order.end());
+  uint64_t different = 0;
+  for (uint64_t i = 0; i < n; ++i) different += i == 0 || order[i].key != order[i - 1].key;
+  size_t size = 16;
+  while (size < 2 * different) size *= 2;
+  cells_.resize(size);
+  entries_.resize(n);
+  for (uint64_t i = 0; i < n;) {
+    uint64_t end = i;
+    while (end < n && order[end].key == order[i].key) {
+      const uint32_t slot = order[end].slot;
+      const NodeGroup& g = tree.group(first + slot / kLanes);
+      const unsigned k = slot % kLanes;
+      entries_[end] = {{g.cx[k], g.cy[k], g.cz[k]}, slot};
+      ++end;
+    }
+    size_t at = Mix64(order[i].key) & (size - 1);
+    while (cells_[at].key != kEmpty) at = (at + 1) & (size - 1);
+    cells_[at] = {order[i].key, static_cast<uint32_t>(i), static_cast<uint32_t>(end - i)};
+    i = end;
+  }
+}
+
+const SurfelGrid::Cell* SurfelGrid::FindCell(uint64_t key) const {
+  size_t at = Mix64(key) & (cells_.size() - 1);
+  while (cells_[at].key != key) {
+    if (cells_[at].key == kEmpty) return nullptr;
+    at = (at + 1) & (cells_.size() - 1);
+  }
+  return &cells_[at];
+}
+
+std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n) const {
+  if (entries_.empty()) return std::nullopt;
+  const Vec3f q = (p - low_) * inverse_cell_ - Vec3f(0.5f);
+  const int64_t x0 = static_cast<int64_t>(std::floor(q.x));
+  const int64_t y0 = static_cast<int64_t>(std::floor(q.y));
+  const int64_t z0 = static_cast<int64_t>(std::floor(q.z));
+  if (x0 < 0 || y0 < 0 || z0 < 0 || x0 >= 1 << 20 || y0 >= 1 << 20 || z0 >= 1 << 20) {
+    return std::nullopt;
+  }
+  const uint32_t first = tree_.first_group(0);
+  float best = spacing_m_ * spacing_m_ * 2.25f;
+  uint32_t found = ~0u;
+  bool front = true;
+  for (int i = 0; i < 8; ++i) {
+    const Cell* cell = FindCell(KeyOf(x0 + (i & 1), y0 + (i >> 1 & 1), z0 + (i >> 2)));
+    if (cell == nullptr) continue;
+    for (uint32_t e = cell->first; e < cell->first + cell->count; ++e) {
+      const float d2 = Length2(entries_[e].position - p);
+      if (!(d2 < best)) continue;
+      const uint32_t slot = entries_[e].slot;
+      const NodeGroup& g = tree_.group(first + slot / kLanes);
+      const unsigned k = slot % kLanes;
+      const float cosine = g.nx[k] * n.x + g.ny[k] * n.y + g.nz[k] * n.z;
+      if (!(std::fabs(cosine) > kSameSurfaceCosine)) continue;
+      best = d2;
+      found = slot;
+      front = cosine > 0.0f;
+    }
+  }
+  if (found == ~0u) return std::nullopt;
+  const RadianceGroup::Sides& sides = tree_.radiance(first + found / kLanes).lane[found % kLanes];
+  return front ? sides.front : sides.back;
+}
+
+namespace {
+
+// A resolved word: bit 63 set; bit 62: no surfel near. Else three mantissas of 17 bits (R lowest)
+// and from bit 51 on an exponent e, biased by 512 (11 bits): channel = mantissa * 2^(e - 16).
+constexpr uint64_t kResolved = uint64_t{1} << 63;
+constexpr uint64_t kNone = uint64_t{1} << 62;
+constexpr int kMantissaBits = 17;
+constexpr uint64_t kMantissaMask = (uint64_t{1} << kMantissaBits) - 1;
+
+uint64_t Encode(const Rgb& c) {
+  const float most = MaxComponent(c);
+  if (!(most > 0.0f)) return kResolved;
+  int exponent = 0;
+  std::frexp(most, &exponent);  // most < 2^exponent
+  const float scale = std::ldexp(1.0f, 16 - exponent);
+  uint64_t word = kResolved | static_cast<uint64_t>(exponent + 512) << (3 * kMantissaBits);
+  for (int i = 0; i < 3; ++i) {
+    const uint64_t m = static_cast<uint64_t>(c[i] * scale + 0.5f);
+    word |= std::min(m, kMantissaMask) << (i * kMantissaBits);
+  }
+  return word;
+}
+
+Rgb Decode(uint64_t word) {
+  const int exponent = static_cast<int>(word >> (3 * kMantissaBits) & 0x7ff) - 512;
+  // 2^(exponent - 16), a normal double.
+  const double scale = std::bit_cast<double>(static_cast<uint64_t>(exponent - 16 + 1023) << 52);
+  const auto channel = [&](int i) {
+    return static_cast<float>(static_cast<double>(word >> (i * kMantissaBits) & kMantissaMask) *
+                              scale);
+  };
+  return {channel(0), channel(1), channel(2)};
+}
+
+}  // namespace
+
+void SurfelAtlas::FreeDeleter::operator()(void* p) const { std::free(p); }
+
+SurfelAtlas::SurfelAtlas(const PreparedScene& scene, const PointTree& tree)
+    : scene_(scene), grid_(tree) {
+  const size_t count = scene.triangles().size();
+  patches_.resize(count);
+  if (!(grid_.spacing_m() > 0.0f)) return;
+  float texel = grid_.spacing_m();
+  uint64_t total = 0;
+  for (;; texel *= 1.5f) {
+    total = 0;
+    for (size_t t = 0; t < count; ++t) {
+      const auto& v = scene.triangles()[t].vertex;
+      const Vec3f a = scene.vertices()[v[0]], b = scene.vertices()[v[1]],
+                  c = scene.vertices()[v[2]];
+      const float longest = std::sqrt(std::max({Length2(b - a), Length2(c - b), Length2(a - c)}));
+      const uint64_t side = std::clamp<uint64_t>(
+          static_cast<uint64_t>(std::min(longest / texel, 16000.0f) + 0.5f), 1, 16000);
+      patches_[t] = {total, side};
+      total += side * side;
+    }
+    if (total <= kMaxTexels || total <= count) break;
+  }
+  // calloc: pages that are never read are never touched.
+  words_.reset(static_cast<uint64_t*>(std::calloc(2 * total, sizeof(uint64_t))));
+}
+
+uint64_t SurfelAtlas::Resolve(uint32_t triangle, uint32_t column, uint32_t row, uint32_t side,
+                              bool front) const {
+  // Column + row < side: the texel's lower half lies in the triangle; else the texel is the mirror
+  // image of one that does (see Radiance), whose upper half it is.
+  const bool upper = column + row >= side;
+  const float inverse = 1.0f / static_cast<float>(side);
+  float b1, b2;
+  if (upper) {
+    b1 = (static_cast<float>(side - 1 - column) + 2.0f / 3) * inverse;
+    b2 = (static_cast<float>(side - 1 - row) + 2.0f / 3) * inverse;
+  } else {
+    b1 = (static_cast<float>(column) + 1.0f / 3) * inverse;
+    b2 = (static_cast<float>(row) + 1.0f / 3) * inverse;
+  }
+  const Vec3f n = scene_.GeometricNormal(triangle);
+  const std::optional<Rgb> found = grid_.Find(scene_.PointOn(triangle, b1, b2), front ? n : -n);
+  return found ? Encode(*found) : kResolved | kNone;
+}
+
+std::optional<Rgb> SurfelAtlas::Radiance(uint32_t triangle, float b1, float b2, bool front) const {
+  if (!words_) return std::nullopt;
+  const Patch patch = patches_[triangle];
+  const uint32_t side = static_cast<uint32_t>(patch.side);
+  const float scale = static_cast<float>(side);
+  const float u = std::max(b1, 0.0f) * scale, v = std::max(b2, 0.0f) * scale;
+  uint32_t column = std::min(static_cast<uint32_t>(u), side - 1);
+  uint32_t row = std::min(static_cast<uint32_t>(v), side - 1);
+  // Micro-triangles: the lower left half of cell (column, row) keeps the cell's place, the upper
+  // right half goes to the mirrored cell, which lies outside of the triangle.
+  const bool upper = column + row < side - 1 &&
+                     (u - static_cast<float>(column)) + (v - static_cast<float>(row)) > 1.0f;
+  if (column + row >= side) {  // by rounding at the hypotenuse
+    row = side - 1 - column;
+  }
+  if (upper) {
+    column = side - 1 - column;
+    row = side - 1 - row;
+  }
+  uint64_t& word = words_[2 * (patch.first + uint64_t{row} * side + column) + (front ? 0 : 1)];
+  const std::atomic_ref<uint64_t> cell(word);
+  uint64_t value = cell.load(std::memory_order_relaxed);
+  if (value == 0) {
+    value = Resolve(triangle, column, row, side, front);
+    cell.store(value, std::memory_order_relaxed);
+  }
+  if ((value & kNone) != 0) return std::nullopt;
+  return Decode(value);
+}
+
+}  // namespace farpoint

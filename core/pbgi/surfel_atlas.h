@@ -1,0 +1,83 @@
+// What a ray that hits a triangle brings back, without shading the point afresh: the radiance of
+// the surfel nearest to it. Triangles are cut into texels about as large as a surfel; a texel is
+// resolved when it is first read, by a search in a hash grid, and then costs one or two cache
+// lines.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include "core/math/vec.h"
+#include "core/pbgi/point_tree.h"
+#include "core/scene/prepared_scene.h"
+
+namespace farpoint {
+
+// The surfel nearest to a point, by a hash grid over the tree's surfels. Immutable; thread-safe.
+class SurfelGrid {
+ public:
+  // `tree` must outlive the grid.
+  explicit SurfelGrid(const PointTree& tree);
+
+  // The radiance [W/(m² sr)] on the side of `n` (unit) of the nearest surfel within 1.5 spacings of
+  // `p` whose plane is within 60° of n's; none if there is none.
+  std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n) const;
+
+  // sqrt(mean area of a surfel); 0 for an empty tree.
+  float spacing_m() const { return spacing_m_; }
+
+ private:
+  struct Entry {
+    Vec3f position;
+    uint32_t slot;
+  };
+  struct Cell {
+    uint64_t key = kEmpty;
+    uint32_t first = 0, count = 0;
+  };
+  static constexpr uint64_t kEmpty = ~uint64_t{0};
+  const Cell* FindCell(uint64_t key) const;
+
+  const PointTree& tree_;
+  float spacing_m_ = 0, inverse_cell_ = 0;
+  Vec3f low_;
+  std::vector<Entry> entries_;  // cell by cell
+  std::vector<Cell> cells_;     // open addressing, a power of two
+};
+
+// Thread-safe: a texel's value is a function of scene and tree, so it does not matter who resolves
+// it, and when.
+class SurfelAtlas {
+ public:
+  // Scene and tree must belong together and outlive the atlas. 16 bytes a texel, of memory that is
+  // touched when it is read; at most kMaxTexels (then texels are larger than surfels).
+  SurfelAtlas(const PreparedScene& scene, const PointTree& tree);
+
+  // The radiance at the point (b1, b2) of `triangle` on the side of its front (winding) or back, as
+  // SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits below the largest channel.
+  std::optional<Rgb> Radiance(uint32_t triangle, float b1, float b2, bool front) const;
+
+  float spacing_m() const { return grid_.spacing_m(); }
+
+  static constexpr uint64_t kMaxTexels = uint64_t{1} << 28;
+
+ private:
+  struct FreeDeleter {
+    void operator()(void* p) const;
+  };
+  struct Patch {
+    uint64_t first : 40, side : 24;  // side² texels from `first`
+  };
+  uint64_t Resolve(uint32_t triangle, uint32_t column, uint32_t row, uint32_t side,
+                   bool front) const;
+
+  const PreparedScene& scene_;
+  SurfelGrid grid_;
+  std::vector<Patch> patches_;  // by triangle
+  // Two words a texel, front and back: 0: not resolved yet; see the .cc.
+  std::unique_ptr<uint64_t[], FreeDeleter> words_;
+};
+
+}  // namespace farpoint

@@ -1,0 +1,53 @@
+// Fills the buffers of gather records: by rays, or by cuts of the point tree.
+#pragma once
+
+#include <memory>
+
+#include "core/base/stats.h"
+#include "core/pbgi/microbuffer_map.h"
+#include "core/pbgi/receiver_hierarchy.h"
+#include "core/pbgi/tree_cut.h"
+#include "core/render/camera_rays.h"
+#include "core/render/loaded_scene.h"
+#include "core/render/settings.h"
+
+namespace farpoint {
+
+// By rays: one through each stratum of the hemisphere; what it brings back is the radiance of the
+// nearest surfel, or, near the receiver, where a surfel's size would show, that of the point itself
+// (one shadow ray per light). By cuts: the receiver's own cut from the root (§1.1), rasterized into
+// its microbuffer, whose pixels then stand for the strata.
+class RecordGatherer final : public RecordSource {
+ public:
+  // All must outlive the gatherer. `settings.fill` decides the way.
+  RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
+                 const RenderSettings& settings, const MicrobufferMap& map,
+                 const CutParams& cut_params);
+
+  bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
+  GatherRecord Gather(const Receiver& receiver, const HemisphereGrid& grid,
+                      uint64_t key) const override;
+
+  // Seconds of the stages trace, cut and raster, and counts, since the last call.
+  Stats TakeStats() const;
+
+ private:
+  GatherRecord GatherByRays(const Receiver& receiver, const HemisphereGrid& grid,
+                            uint64_t key) const;
+  GatherRecord GatherByCut(const Receiver& receiver, const HemisphereGrid& grid) const;
+
+  const LoadedSceneData& scene_;
+  const CameraRays& rays_;
+  const RenderSettings& settings_;
+  const MicrobufferMap& map_;
+  const CutParams& cut_params_;
+  const SurfelAtlas* atlas_ = nullptr;  // null: shade every hit
+  float near_m_ = 0;                    // hits nearer than this are shaded afresh
+  mutable std::mutex mutex_;
+  mutable Stats stats_;
+};
+
+// The receiver of a hit by a ray of direction `w`, turned towards where the ray came from.
+Receiver ReceiverOfHit(const PreparedScene& scene, const RayHit& hit, const Vec3f& w);
+
+}  // namespace farpoint

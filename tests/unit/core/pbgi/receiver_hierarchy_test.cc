@@ -1,0 +1,243 @@
+#include "core/pbgi/receiver_hierarchy.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <map>
+#include <set>
+
+#include "core/math/sampling.h"
+
+namespace farpoint {
+namespace {
+
+// A floor seen from above, one metre a pixel, with a step at x = 40 and a pole of background; its
+// irradiance is linear in x, and records know its slope.
+class Floor final : public RecordSource {
+ public:
+  bool ReceiverAt(int x, int y, Receiver& r, float& footprint_m) const override {
+    if (x >= 20 && x < 23 && y < 30) return false;
+    r = At(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f);
+    footprint_m = 1;
+    return true;
+  }
+  static Receiver At(float x, float y) {
+    Receiver r;
+    r.position = {x, y, x < 40 ? 0.0f : 30.0f};
+    r.normal = r.geometric_normal = {0, 0, 1};
+    return r;
+  }
+  static float Irradiance(const Receiver& r) {
+    return (r.position.z > 0 ? 5.0f : 1.0f) + 0.01f * r.position.x;
+  }
+  GatherRecord Gather(const Receiver& r, const HemisphereGrid&, uint64_t key) const override {
+    GatherRecord g;
+    g.position = r.position;
+    g.normal = r.normal;
+    const float e = Irradiance(r);
+    g.irradiance = Rgb(e, 2 * e, 0);
+    g.gradient = {Vec3f(0.01f, 0, 0), Vec3f(0.02f, 0, 0), Vec3f()};
+    // Some places are narrow.
+    g.harmonic_distance_m = key % 3 == 0 ? 40.0f : 200.0f;
+    return g;
+  }
+};
+
+const PixelRect kFrame{0, 0, 100, 75};
+
+// Everything that decides what a record brings.
+using Key = std::tuple<float, float, float, float, float>;
+std::set<Key> KeysWithin(const ReceiverHierarchy::View& view, const PixelRect& rect) {
+  std::vector<const ScreenRecord*> records;
+  view.Collect(rect, records);
+  std::set<Key> keys;
+  for (const ScreenRecord* r : records) {
+    keys.insert({r->x_px, r->y_px, r->screen_reach_px, r->gather.reach_m, r->gather.irradiance.x});
+  }
+  EXPECT_EQ(keys.size(), records.size());
+  return keys;
+}
+
+TEST(ReceiverHierarchy, RecordsDoNotDependOnTilesThreadsOrEarlierCalls) {
+  const Floor floor;
+  const HierarchyParams params;
+  Executor one(1), two(2);
+  ReceiverHierarchy::Counts counts;
+  const ReceiverHierarchy whole(params, kFrame, floor);
+  const auto all = whole.Prepare(kFrame, one, {}, counts);
+  for (const int tile : {32, 96}) {
+    const ReceiverHierarchy tiled(params, kFrame, floor);
+    for (int y = 64 / tile * tile; y >= 0; y -= tile) {
+      for (int x = 96 / tile * tile; x >= 0; x -= tile) {
+        const PixelRect rect = PixelRect{x, y, x + tile, y + tile}.Intersect(kFrame);
+        if (rect.empty()) continue;
+        const ReceiverHierarchy fresh(params, kFrame, floor);
+        const auto a = tiled.Prepare(rect, two, {}, counts);
+        const auto b = fresh.Prepare(rect, one, {}, counts);
+        EXPECT_EQ(KeysWithin(*a, rect), KeysWithin(*all, rect)) << tile << " " << x << " " << y;
+        EXPECT_EQ(KeysWithin(*b, rect), KeysWithin(*all, rect)) << tile << " " << x << " " << y;
+      }
+    }
+  }
+}
+
+TEST(ReceiverHierarchy, EveryPixelIsServedAndALinearFieldIsReproduced) {
+  const Floor floor;
+  const ReceiverHierarchy hierarchy({}, kFrame, floor);
+  Executor executor(2);
+  ReceiverHierarchy::Counts counts;
+  const auto view = hierarchy.Prepare(kFrame, executor, {}, counts);
+  std::vector<const ScreenRecord*> records;
+  for (int y = 0; y < kFrame.y1; ++y) {
+    for (int x = 0; x < kFrame.x1; ++x) {
+      Receiver r;
+      float footprint;
+      if (!floor.ReceiverAt(x, y, r, footprint)) continue;
+      records.clear();
+      view->Collect({x, y, x + 1, y + 1}, records);
+      const ServedReceiver served{&r, static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f};
+      Rgb e;
+      float weight;
+      BlendRecords(records, {&served, 1}, {&e, 1}, {&weight, 1});
+      EXPECT_GE(weight, hierarchy.params().enough) << x << " " << y;
+      EXPECT_NEAR(e.x, Floor::Irradiance(r), 2e-5f) << x << " " << y;
+      EXPECT_NEAR(e.y, 2 * Floor::Irradiance(r), 4e-5f) << x << " " << y;
+    }
+  }
+  // Far fewer records than pixels, and every call counts what it made.
+  EXPECT_LT(counts.records, 7500u / 4);
+  EXPECT_GT(counts.records, 30u);
+  const uint64_t before = counts.records;
+  hierarchy.Prepare(kFrame, executor, {}, counts);
+  EXPECT_EQ(counts.records, before);
+}
+
+TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
+  std::vector<ScreenRecord> records(60);
+  const auto u = [](int i, int k) {
+    return ToUnitFloat(
+        static_cast<uint32_t>(HashKey(3, static_cast<uint64_t>(i), static_cast<uint64_t>(k))));
+  };
+  for (int i = 0; i < 60; ++i) {
+    ScreenRecord& r = records[static_cast<size_t>(i)];
+    r.x_px = 8 * u(i, 0);
+    r.y_px = 8 * u(i, 1);
+    r.screen_reach_px = 1.5f * static_cast<float>(1 << (i % 4));
+    r.gather.position = {r.x_px, r.y_px, 0.2f * u(i, 2)};
+    r.gather.normal = Normalize(Vec3f(0.4f * u(i, 3), 0.3f * u(i, 4), 1));
+    r.gather.reach_m = 0.5f + 6 * u(i, 5);
+    r.gather.irradiance = {u(i, 6), u(i, 7), 0};
+    for (int c = 0; c < 3; ++c) {
+      r.gather.gradient[static_cast<size_t>(c)] = {u(i, 8 + c) - 0.5f, u(i, 11 + c) - 0.5f, 0};
+      r.gather.vector[static_cast<size_t>(c)] = {u(i, 20 + c), u(i, 23 + c) - 0.5f, u(i, 26 + c)};
+    }
+  }
+  std::vector<const ScreenRecord*> list;
+  for (const ScreenRecord& r : records) list.push_back(&r);
+  std::vector<Receiver> receivers(8);
+  std::vector<ServedReceiver> served;
+  for (int i = 0; i < 8; ++i) {
+    Receiver& r = receivers[static_cast<size_t>(i)];
+    r.position = {8 * u(i, 100), 8 * u(i, 101), 0.1f};
+    r.normal = Normalize(Vec3f(0.3f * u(i, 103), 0.2f, 1));
+    served.push_back({&r, r.position.x, r.position.y});
+  }
+  std::vector<Rgb> e(8);
+  std::vector<float> weight(8);
+  BlendRecords(list, served, e, weight);
+  for (size_t i = 0; i < 8; ++i) {
+    Vec3d sum;
+    double weights = 0;
+    const Receiver& x = receivers[i];
+    for (const ScreenRecord& r : records) {
+      const double du = static_cast<double>(served[i].x_px - r.x_px);
+      const double dv = static_cast<double>(served[i].y_px - r.y_px);
+      const double screen = 1 - (du * du + dv * dv) / (static_cast<double>(r.screen_reach_px) *
+                                                       static_cast<double>(r.screen_reach_px));
+      const Vec3d d = Vec3d(x.position) - Vec3d(r.gather.position);
+      const double off = std::fabs(Dot(d, Vec3d(x.normal) + Vec3d(r.gather.normal)));
+      const double turned =
+          std::sqrt(std::max(0.0, 1 - Dot(Vec3d(x.normal), Vec3d(r.gather.normal))) /
+                    static_cast<double>(kNormalTolerance));
+      const double w = 1 - (Length(d) + off) / static_cast<double>(r.gather.reach_m) - turned;
+      if (!(w > 0) || !(screen > 0)) continue;
+      const double share = w * w * screen * screen;
+      weights += share;
+      sum += Vec3d(IrradianceAt(r.gather, x.position, x.normal)) * share;
+    }
+    ASSERT_GT(weights, 0) << i;
+    EXPECT_NEAR(weight[i], weights, 1e-4 * weights) << i;
+    EXPECT_NEAR(e[i].x, sum.x / weights, 2e-4) << i;
+    EXPECT_NEAR(e[i].y, sum.y / weights, 2e-4) << i;
+    // Alone, the same bits.
+    Rgb alone;
+    float alone_weight;
+    BlendRecords(list, {&served[i], 1}, {&alone, 1}, {&alone_weight, 1});
+    EXPECT_EQ(alone, e[i]);
+    EXPECT_EQ(alone_weight, weight[i]);
+  }
+}
+
+TEST(ReceiverHierarchy, StopsWhenItIsTold) {
+  const Floor floor;
+  const ReceiverHierarchy hierarchy({}, kFrame, floor);
+  Executor executor(2);
+  ReceiverHierarchy::Counts counts;
+  EXPECT_EQ(hierarchy.Prepare(
+                kFrame, executor, [](double) { return false; }, counts),
+            nullptr);
+  double last = 0;
+  std::mutex mutex;
+  const auto view = hierarchy.Prepare(
+      kFrame, executor,
+      [&](double part) {
+        const std::lock_guard lock(mutex);
+        EXPECT_GT(part, 0);
+        EXPECT_LE(part, 1);
+        last = std::max(last, part);
+        return true;
+      },
+      counts);
+  EXPECT_NE(view, nullptr);
+  EXPECT_GT(last, 0.5);
+}
+
+// A camera on a surface sees it at depth 0: no footprint, no reach, and still a record.
+TEST(ReceiverHierarchy, ARecordWithoutReachServesItsOwnReceiver) {
+  class Point final : public RecordSource {
+   public:
+    bool ReceiverAt(int, int, Receiver& r, float& footprint_m) const override {
+      r.normal = r.geometric_normal = {0, 0, 1};
+      footprint_m = 0;
+      return true;
+    }
+    GatherRecord Gather(const Receiver& r, const HemisphereGrid&, uint64_t) const override {
+      GatherRecord g;
+      g.normal = r.normal;
+      g.irradiance = Rgb(1, 1, 1);
+      g.harmonic_distance_m = 1;
+      return g;
+    }
+  };
+  const Point point;
+  const PixelRect frame{0, 0, 3, 1};
+  const ReceiverHierarchy hierarchy({}, frame, point);
+  Executor executor(1);
+  ReceiverHierarchy::Counts counts;
+  const auto view = hierarchy.Prepare(frame, executor, {}, counts);
+  for (int x = 0; x < 3; ++x) {
+    std::vector<const ScreenRecord*> records;
+    view->Collect({x, 0, x + 1, 1}, records);
+    Receiver r;
+    r.normal = {0, 0, 1};
+    const ServedReceiver served{&r, static_cast<float>(x) + 0.5f, 0.5f};
+    Rgb e;
+    float weight;
+    BlendRecords(records, {&served, 1}, {&e, 1}, {&weight, 1});
+    EXPECT_EQ(e, Rgb(1, 1, 1));
+    EXPECT_GT(weight, 0);
+  }
+}
+
+}  // namespace
+}  // namespace farpoint

@@ -1,0 +1,149 @@
+#include "core/pbgi/surfel_atlas.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "core/math/sampling.h"
+#include "tests/unit/core/pbgi/test_cloud.h"
+
+namespace farpoint {
+namespace {
+
+// A square of edge 4 m in z = 0 as two triangles, and a sliver beside it.
+std::shared_ptr<const PreparedScene> Plane() {
+  Scene scene;
+  Mesh mesh;
+  mesh.positions = {{-2, -2, 0}, {2, -2, 0}, {2, 2, 0}, {-2, 2, 0}, {-2, 2.05f, 0}};
+  mesh.triangles = {{0, 1, 2}, {0, 2, 3}, {3, 2, 4}};
+  scene.meshes.push_back(mesh);
+  scene.instances.push_back({});
+  Executor executor(1);
+  return PreparedScene::Prepare(scene, executor).value();
+}
+
+Rgb Pattern(const Vec3f& p) { return {1 + 0.2f * p.x, 0.5f + 0.1f * p.y, 0.01f}; }
+
+TestCloud Cloud(const Vec3f& origin) {
+  TestCloud t;
+  for (int j = 0; j < 40; ++j) {
+    for (int i = 0; i < 40; ++i) {
+      const Vec3f p(-1.95f + 0.1f * static_cast<float>(i), -1.95f + 0.1f * static_cast<float>(j),
+                    0);
+      t.Add(p - origin, {0, 0, 1}, 0.01f, Pattern(p), Pattern(p) * 3.0f);
+    }
+  }
+  return t;
+}
+
+TEST(SurfelGrid, FindsTheNearestOfTheRightSide) {
+  const auto tree = RandomCloud(500, 9).Build();
+  const SurfelGrid grid(*tree);
+  const uint32_t first = tree->first_group(0);
+  int found = 0;
+  for (uint64_t i = 0; i < 20000; ++i) {
+    const auto u = [&](uint64_t k) {
+      return ToUnitFloat(static_cast<uint32_t>(HashKey(77, i, k)));
+    };
+    const Vec3f p(u(0) * 4 - 2, u(1) * 2 - 1, u(2) * 3 - 1);
+    const Vec3f n = UniformSphere(u(3), u(4));
+    // The literal search over all surfels.
+    float best = 2.25f * grid.spacing_m() * grid.spacing_m();
+    std::optional<Rgb> expected;
+    for (uint32_t s = 0; s < tree->surfel_count(); ++s) {
+      const NodeGroup& g = tree->group(first + s / kLanes);
+      const uint32_t k = s % kLanes;
+      const Vec3f c(g.cx[k], g.cy[k], g.cz[k]), m(g.nx[k], g.ny[k], g.nz[k]);
+      if (std::fabs(Dot(m, n)) <= 0.5f || !(Length2(c - p) < best)) continue;
+      // The grid looks only at the eight cells about p, which hold all within one spacing.
+      best = Length2(c - p);
+      const auto& sides = tree->radiance(first + s / kLanes).lane[k];
+      expected = Dot(m, n) > 0 ? sides.front : sides.back;
+    }
+    const std::optional<Rgb> got = grid.Find(p, n);
+    if (expected && best <= grid.spacing_m() * grid.spacing_m()) {
+      ASSERT_TRUE(got.has_value()) << i;
+      EXPECT_EQ(*got, *expected) << i;
+      ++found;
+    }
+    if (!expected) {
+      EXPECT_FALSE(got.has_value()) << i;
+    }
+  }
+  EXPECT_GT(found, 20);
+}
+
+TEST(SurfelGrid, AnEmptyTreeHasNothing) {
+  const auto tree = TestCloud().Build();
+  const SurfelGrid grid(*tree);
+  EXPECT_FALSE(grid.Find({0, 0, 0}, {0, 0, 1}).has_value());
+  const auto scene = Plane();
+  EXPECT_FALSE(SurfelAtlas(*scene, *tree).Radiance(0, 0.3f, 0.3f, true).has_value());
+}
+
+TEST(SurfelAtlas, EveryPointReadsASurfelNearItOnItsSide) {
+  const auto scene = Plane();
+  const Vec3f origin(scene->origin());
+  const auto tree = Cloud(origin).Build();
+  const SurfelAtlas atlas(*scene, *tree);
+  EXPECT_NEAR(atlas.spacing_m(), 0.1f, 1e-3f);
+  for (int pass = 0; pass < 2; ++pass) {  // resolved, then read again
+    for (int i = 0; i <= 60; ++i) {
+      for (int j = 0; i + j <= 60; ++j) {
+        const float b1 = static_cast<float>(i) / 60, b2 = static_cast<float>(j) / 60;
+        for (const uint32_t t : {0u, 1u}) {
+          const Vec3f p = scene->PointOn(t, b1, b2) + origin;
+          const auto front = atlas.Radiance(t, b1, b2, true);
+          const auto back = atlas.Radiance(t, b1, b2, false);
+          ASSERT_TRUE(front && back) << b1 << " " << b2;
+          // The texel's centre is within a spacing, and so is its surfel.
+          EXPECT_NEAR(front->x, Pattern(p).x, 0.2f * 0.25f) << b1 << " " << b2;
+          EXPECT_NEAR(front->y, Pattern(p).y, 0.1f * 0.25f);
+          EXPECT_NEAR(back->x, 3 * front->x, 1e-3f * back->x);
+          EXPECT_NEAR(front->z, 0.01f, 3e-5f);
+        }
+      }
+    }
+  }
+}
+
+TEST(SurfelAtlas, TexelsTileTheTriangle) {
+  const auto scene = Plane();
+  const Vec3f origin(scene->origin());
+  const auto tree = Cloud(origin).Build();
+  const SurfelAtlas atlas(*scene, *tree);
+  // The mean over the triangle is the pattern's mean: no texel is read for too large a part.
+  Vec3d sum, expected;
+  const int n = 20000;
+  for (uint32_t i = 0; i < n; ++i) {
+    const Vec2f b = UniformTriangle(OwenSobol(i, 0, 1), OwenSobol(i, 1, 1));
+    sum += Vec3d(*atlas.Radiance(0, b.x, b.y, true));
+    expected += Vec3d(Pattern(scene->PointOn(0, b.x, b.y) + origin));
+  }
+  EXPECT_NEAR(sum.x / expected.x, 1, 5e-3);
+  EXPECT_NEAR(sum.y / expected.y, 1, 5e-3);
+}
+
+TEST(SurfelAtlas, KeepsRadianceOfAnyBrightness) {
+  const auto scene = Plane();
+  const Vec3f origin(scene->origin());
+  for (const float scale : {1e-30f, 1e-6f, 1.0f, 1e6f, 1e30f}) {
+    TestCloud t;
+    for (int i = 0; i < 1600; ++i) {
+      t.Add(Vec3f(-1.95f + 0.1f * static_cast<float>(i % 40),
+                  -1.95f + 0.1f * static_cast<float>(i / 40), 0) -
+                origin,
+            {0, 0, 1}, 0.01f, Rgb(1, 0.5f, 0) * scale);
+    }
+    const auto tree = t.Build();
+    const auto got = SurfelAtlas(*scene, *tree).Radiance(0, 0.2f, 0.3f, true);
+    ASSERT_TRUE(got.has_value());
+    EXPECT_NEAR(got->x / scale, 1, 2e-5);
+    EXPECT_NEAR(got->y / scale, 0.5, 2e-5);
+    EXPECT_EQ(got->z, 0);
+    EXPECT_EQ(SurfelAtlas(*scene, *tree).Radiance(0, 0.2f, 0.3f, false), Rgb());
+  }
+}
+
+}  // namespace
+}  // namespace farpoint
