@@ -14,7 +14,8 @@ namespace farpoint {
 namespace {
 
 absl::StatusOr<size_t> OpenForReading(const std::string& path, Descriptor& file) {
-  file.Reset(::open(path.c_str(), O_RDONLY | O_CLOEXEC));
+  // Without O_NONBLOCK the open of a FIFO waits for a writer; regular files know no difference.
+  file.Reset(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));
   if (!file.valid()) return FileError("cannot open", path, errno);
   struct stat info {};
   if (::fstat(file.get(), &info) != 0) return FileError("cannot examine", path, errno);
