@@ -96,8 +96,13 @@ absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& cons
   FP_RETURN_IF_ERROR(CheckOutputs(line));
   usage_error = true;
   FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
-  FP_ASSIGN_OR_RETURN(const PreparedRequest request,
+  FP_ASSIGN_OR_RETURN(PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
+  for (const std::string& note : request.notes) console.Info(note);
+  if (request.spec.start_paused) {
+    console.Info("start_paused says nothing to render: nobody could resume the job");
+    request.spec.start_paused = false;
+  }
   const JobSpec& spec = request.spec;
   usage_error = true;
   FP_RETURN_IF_ERROR(writer.CheckNames(spec.frame_count(), !spec.frames.empty()));
@@ -133,6 +138,7 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
   FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   FP_ASSIGN_OR_RETURN(PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
+  for (const std::string& note : request.notes) console.Info(note);
   JobSpec& spec = request.spec;
   if (line.title) spec.title = *line.title;
   if (line.priority) spec.priority = *line.priority;

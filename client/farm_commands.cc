@@ -1,6 +1,7 @@
 #include "client/farm_commands.h"
 
 #include <algorithm>
+#include <cerrno>
 #include <chrono>
 #include <cstdio>
 #include <map>
@@ -87,8 +88,12 @@ class LineOutput {
         std::fflush(stream_.get()) == 0) {
       return absl::OkStatus();
     }
-    return absl::ResourceExhaustedError("the log cannot be written; is the disk full?");
+    closed_ = errno == EPIPE;
+    if (closed_) return absl::AbortedError("nobody reads the log any more");
+    return absl::UnavailableError("the log cannot be written; is the disk full?");
   }
+  // Whether the reader went away, as head does: no failure.
+  bool closed() const { return closed_; }
 
  private:
   LineOutput(std::FILE* stream, bool owned)
@@ -96,6 +101,7 @@ class LineOutput {
             stream, owned ? [](std::FILE* file) { std::fclose(file); } : [](std::FILE*) {}) {}
 
   std::unique_ptr<std::FILE, void (*)(std::FILE*)> stream_;
+  bool closed_ = false;
 };
 
 // Several jobs at once, by asking again and again.
@@ -125,6 +131,28 @@ absl::StatusOr<std::vector<JobStatus>> WatchSeveral(FarmSession& session, std::s
 }
 
 }  // namespace
+
+std::string ControlText(Verb verb, const JobStatus& status) {
+  std::string text = "job " + status.id.value + " is " + std::string(NameOf(status.state));
+  if (verb == Verb::kPriority) text += ", its priority " + std::to_string(status.priority);
+  if (!IsFinal(status.state)) return text;
+  switch (verb) {
+    case Verb::kPriority:
+      return text + ", of no effect unless it is requeued";
+    case Verb::kCancel:
+      if (status.state == JobState::kCancelled) return text;
+      return text + "; nothing was done";
+    case Verb::kPause:
+    case Verb::kResume:
+      if (status.state == JobState::kDone) return text + "; nothing was done";
+      return text + "; farpoint requeue " + status.id.value + " lets it go on";
+    case Verb::kRequeue:
+      if (status.state != JobState::kDone) return text;
+      return text + "; nothing was done, --all renders it again";
+    default:
+      return text;
+  }
+}
 
 absl::Status RunStatus(FarmSession session) {
   const JobId job{session.line.jobs.empty() ? std::string() : session.line.jobs[0]};
@@ -158,10 +186,7 @@ absl::Status RunControl(FarmSession session) {
     }
     // What came of it: pausing a job that is done leaves it done.
     FP_ASSIGN_OR_RETURN(JobStatus status, StatusOf(session, job));
-    session.console.Info("job " + id + " is " + std::string(NameOf(status.state)) +
-                         (session.line.verb == Verb::kPriority
-                              ? ", its priority " + std::to_string(status.priority)
-                              : std::string()));
+    session.console.Info(ControlText(session.line.verb, status));
     statuses.push_back(std::move(status));
   }
   FP_RETURN_IF_ERROR(WriteJobs(session.line, statuses));
@@ -219,7 +244,7 @@ absl::Status RunLogs(FarmSession session) {
       return output.Write(json ? LogJson(event) : LogText(event));
     });
   });
-  if (caught_up && absl::IsAborted(status)) return absl::OkStatus();
+  if ((caught_up || output.closed()) && absl::IsAborted(status)) return absl::OkStatus();
   return status;
 }
 

@@ -2,6 +2,8 @@
 // of them fetches an image.
 #pragma once
 
+#include <string>
+
 #include "client/command_line.h"
 #include "client/console.h"
 #include "client/farm_link.h"
@@ -25,6 +27,8 @@ absl::Status RunWorkers(FarmSession session);
 // pause, resume, cancel, requeue, priority: each job in turn. A job that cannot be found does not
 // keep the others from their turn; the first error is returned, further ones are shown.
 absl::Status RunControl(FarmSession session);
+// What came of one of them: the job's state, and what to do if the command did nothing.
+std::string ControlText(Verb verb, const JobStatus& status);
 // Until the jobs have ended. OK if all are done; else the worst of their outcomes, a permanent
 // failure before one that may heal; the others are shown.
 absl::Status RunWatch(FarmSession session);

@@ -1,6 +1,7 @@
 #include "client/image_writer.h"
 
 #include <algorithm>
+#include <cerrno>
 #include <cstdio>
 #include <span>
 #include <utility>
@@ -28,6 +29,7 @@ absl::Status CheckName(const FramePath& path, const std::string& flag, const std
 absl::Status WriteText(const std::string& file, const std::string& text) {
   if (file != "-") return WriteFileAtomically(file, std::as_bytes(std::span(text)));
   if (std::fwrite(text.data(), 1, text.size(), stdout) != text.size() || std::fflush(stdout) != 0) {
+    if (errno == EPIPE) return absl::OkStatus();  // the reader has seen enough, as head does
     return absl::UnavailableError("stdout cannot be written");
   }
   return absl::OkStatus();

@@ -1,10 +1,12 @@
 #include "client/job_request.h"
 
+#include <algorithm>
 #include <filesystem>
 #include <utility>
 
 #include "core/base/blob.h"
 #include "core/scene/environment_image.h"
+#include "core/scene/importer.h"
 #include "proto/convert.h"
 
 namespace farpoint {
@@ -39,7 +41,7 @@ absl::StatusOr<JobFile> ReadJobFile(const std::string& path) {
                         : (std::filesystem::path(path).parent_path() / root).string();
   if (IsJobFile(file.asset_path)) {
     return absl::InvalidArgumentError(path + ": asset.root: " + wire.asset().root() +
-                                      " is a job file; name a .gltf or .glb");
+                                      " is a job file; name a .gltf, .glb, .obj or .ply");
   }
   FP_RETURN_IF_ERROR(Annotate(CheckScenePath(file.asset_path), path + ": asset.root"));
   auto spec = JobFromWire(wire);
@@ -87,6 +89,19 @@ v1::RenderJob ImageJob(JobSpec spec) {
   return wire;
 }
 
+std::vector<std::string> NotesOn(const PreparedRequest& request, std::span<const GivenFlag> flags) {
+  if (request.spec.frames.empty()) {
+    const bool fps = std::any_of(flags.begin(), flags.end(),
+                                 [](const GivenFlag& flag) { return flag.first == "--fps"; });
+    if (fps) return {"--fps says nothing of a still; --frames renders the animation"};
+    return {};
+  }
+  // A scene that is wrong is refused later, with its place.
+  const auto animation = FindAnimation(request.asset);
+  if (!animation.ok() || animation->has_value()) return {};
+  return {"the scene has no animation: all of its frames are alike"};
+}
+
 }  // namespace
 
 absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
@@ -114,6 +129,7 @@ absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
     request.spec.asset_files[uri] = blob.Hash();
   }
   FP_RETURN_IF_ERROR(Annotate(ValidateJob(request.spec), scene));
+  request.notes = NotesOn(request, flags);
   return request;
 }
 

@@ -3,6 +3,7 @@
 
 #include <span>
 #include <string>
+#include <vector>
 
 #include "client/render_flags.h"
 #include "core/base/status.h"
@@ -14,6 +15,8 @@ namespace farpoint {
 struct PreparedRequest {
   JobSpec spec;       // complete and valid
   AssetBundle asset;  // the files that spec.asset_files names
+  // What a user should know, one line each: flags and frames that have no effect.
+  std::vector<std::string> notes;
 };
 
 // `scene` is a scene or a job file. A job file's paths (asset, environment map) are relative to it,

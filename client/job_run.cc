@@ -53,8 +53,8 @@ absl::Status OutcomeOf(const JobStatus& status) {
       return Annotate(status.error, context);
     }
     case JobState::kCancelled:
-      return absl::CancelledError("job " + status.id.value +
-                                  " was cancelled; submit it again to render it");
+      return absl::CancelledError("job " + status.id.value + " was cancelled; farpoint requeue " +
+                                  status.id.value + " lets it go on");
     case JobState::kPaused:
       return absl::UnavailableError("job " + status.id.value + " is paused; farpoint resume " +
                                     status.id.value + " lets it go on");

@@ -367,7 +367,10 @@ constexpr RenderFlag kRenderFlags[] = {
        return ParseCount(value, edit.spec.settings.paths);
      }},
     {"--light-samples", "N", kMethod,
-     "shadow rays per receiver or surfel and light, 1..4096; default 32",
+     "shadow rays per receiver, 1..4096; default 32: N for all emitters, N for the sky or map, one "
+     "per point or spot light up to max(N, 8) of them, N drawn among more; a surfel takes a "
+     "quarter "
+     "of them on each side",
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.light_samples);
      }},

@@ -179,6 +179,8 @@ absl::Status CheckMessage(const Json& value, const std::string& path, const Desc
 
 absl::StatusOr<v1::RenderJob> RenderJobFromJson(std::string_view text, std::string_view name) {
   const std::string file = "'" + std::string(name) + "' is not a job file";
+  // A byte order mark, as some editors write it.
+  if (text.starts_with("\xEF\xBB\xBF")) text.remove_prefix(3);
   Json json;
   try {
     json = Json::parse(text.begin(), text.end());

@@ -2,6 +2,7 @@
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <sys/stat.h>
 
 #include <filesystem>
 
@@ -12,7 +13,9 @@ namespace farpoint {
 namespace {
 
 using testing::AllOf;
+using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::IsEmpty;
 using testing::StartsWith;
 
 constexpr char kGltf[] = R"({"asset": {"version": "2.0"},
@@ -81,7 +84,8 @@ TEST_F(PrepareRequestTest, DamagedJobFilesAreTheFilesFault) {
   EXPECT_THAT(FileError(Job("{}")), HasSubstr("asset.root"));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "../scenes/a.gltf"}, "settings": {"spp": 0}})")),
               AllOf(StartsWith(folder_.File("jobs/job.json")), HasSubstr("spp")));
-  EXPECT_THAT(FileError(Job(R"({"asset": {"root": "job.json"}})")), HasSubstr("job file"));
+  EXPECT_THAT(FileError(Job(R"({"asset": {"root": "job.json"}})")),
+              AllOf(HasSubstr("job file"), HasSubstr(".ply")));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "a.xyz"}})")),
               AllOf(HasSubstr("asset.root"), HasSubstr(".gltf")));
   EXPECT_THAT(FileError(Job(R"({"asset": {"root": "../scenes/a.gltf", "files": [{"uri": "x"}]}})")),
@@ -148,6 +152,30 @@ TEST_F(PrepareRequestTest, AMapThatCannotBeReadIsNamedBeforeAnythingIsSent) {
   EXPECT_THAT(error(WriteMap(folder_.File("layers.exr"))), HasSubstr("layers.exr"));
   EXPECT_FALSE(Prepare(folder_.File("scenes/a.gltf"), {{"--env-rotation", "3"}}).ok());
   EXPECT_TRUE(usage_error_);
+}
+
+TEST_F(PrepareRequestTest, AJobFileMayStartWithAByteOrderMark) {
+  const auto request =
+      Prepare(Job("\xEF\xBB\xBF"
+                  R"({"asset": {"root": "../scenes/a.gltf"}})"));
+  EXPECT_TRUE(request.ok()) << request.status();
+}
+
+TEST_F(PrepareRequestTest, WhatIsNoRegularFileIsRefusedWithoutWaiting) {
+  for (const char* name : {"fifo.obj", "fifo.json"}) {
+    ASSERT_EQ(mkfifo(folder_.File(name).c_str(), 0600), 0);
+    EXPECT_THAT(FileError(folder_.File(name)), HasSubstr("is not a regular file"));
+  }
+  std::filesystem::create_directory(folder_.File("folder.obj"));
+  EXPECT_THAT(FileError(folder_.File("folder.obj")), HasSubstr("is not a regular file"));
+}
+
+TEST_F(PrepareRequestTest, NotesWhatHasNoEffect) {
+  const std::string still = folder_.Write("scenes/still.gltf", R"({"asset": {"version": "2.0"}})");
+  EXPECT_THAT(Prepare(still)->notes, IsEmpty());
+  EXPECT_THAT(Prepare(still, {{"--fps", "25"}})->notes, ElementsAre(HasSubstr("--fps")));
+  EXPECT_THAT(Prepare(still, {{"--fps", "25"}, {"--frames", "1-2"}})->notes,
+              ElementsAre(HasSubstr("no animation")));
 }
 
 TEST_F(PrepareRequestTest, MissingFilesAreNamed) {

@@ -7,6 +7,7 @@
 #include <map>
 #include <set>
 
+#include "client/farm_commands.h"
 #include "tests/unit/client/sample_job.h"
 
 namespace farpoint {
@@ -234,7 +235,23 @@ TEST_F(JobRunTest, HandsOnWhatAJobFailedOf) {
   EXPECT_TRUE(absl::IsInvalidArgument(status));
   EXPECT_THAT(std::string(status.message()), HasSubstr("a.gltf: /meshes/0: no such accessor"));
   farm_.events = {Event(1, JobState::kCancelled)};
-  EXPECT_TRUE(absl::IsCancelled(run_.Wait(JobId{"1"})));
+  const absl::Status cancelled = run_.Wait(JobId{"1"});
+  EXPECT_TRUE(absl::IsCancelled(cancelled));
+  EXPECT_THAT(std::string(cancelled.message()), HasSubstr("farpoint requeue"));
+}
+
+TEST(ControlText, SaysWhatToDoIfNothingWasDone) {
+  JobStatus status;
+  status.id = JobId{"a1"};
+  status.state = JobState::kCancelled;
+  EXPECT_EQ(ControlText(Verb::kCancel, status), "job a1 is cancelled");
+  EXPECT_EQ(ControlText(Verb::kResume, status),
+            "job a1 is cancelled; farpoint requeue a1 lets it go on");
+  status.state = JobState::kDone;
+  EXPECT_EQ(ControlText(Verb::kCancel, status), "job a1 is done; nothing was done");
+  EXPECT_THAT(ControlText(Verb::kPriority, status), HasSubstr("of no effect"));
+  status.state = JobState::kRendering;
+  EXPECT_EQ(ControlText(Verb::kResume, status), "job a1 is rendering");
 }
 
 TEST_F(JobRunTest, StopsWaitingWhenASignalComes) {
