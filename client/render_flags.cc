@@ -142,8 +142,9 @@ absl::Status ApplyClusters(std::string_view value, JobEdit& edit) {
     return absl::OkStatus();
   }
   uint32_t clusters = 0;
-  FP_RETURN_IF_ERROR(ParseCount(value, clusters));
-  if (clusters == 0) return Bad("expected adaptive or the number of clusters per block, 1..1024");
+  if (!ParseCount(value, clusters).ok() || clusters == 0) {
+    return Bad("expected adaptive or the number of clusters per block, 1..1024");
+  }
   edit.spec.settings.clusters = clusters;
   return absl::OkStatus();
 }
