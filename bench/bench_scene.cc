@@ -23,7 +23,7 @@ absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool 
   }
   FP_ASSIGN_OR_RETURN(const AssetBundle asset, CollectAsset(name_or_path));
   FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, ImportOptions()));
-  EnsureCameraAndLight(imported);
+  EnsureCameraAndLight(imported, /*light_chosen=*/false);
   return BenchScene{std::move(imported.scene), std::move(imported.notes)};
 }
 

@@ -14,7 +14,8 @@ enum ExitCode : int {
   kExitTerminated = 143,   // SIGTERM
 };
 
-// OK: 0. kUnavailable, kDeadlineExceeded, kResourceExhausted, kAborted: 75. All others: 42.
+// OK: 0. kUnavailable, kDeadlineExceeded, kAborted: 75. All others: 42, limits
+// (kResourceExhausted) among them: trying again will not cure them.
 int ExitCodeOf(const absl::Status& status);
 
 }  // namespace farpoint

@@ -90,7 +90,7 @@ class LineOutput {
     }
     closed_ = errno == EPIPE;
     if (closed_) return absl::AbortedError("nobody reads the log any more");
-    return absl::UnavailableError("the log cannot be written; is the disk full?");
+    return absl::InternalError("the log cannot be written; is the disk full?");
   }
   // Whether the reader went away, as head does: no failure.
   bool closed() const { return closed_; }

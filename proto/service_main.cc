@@ -15,7 +15,6 @@ int ServiceExitCode(const absl::Status& status) {
       return 0;
     case absl::StatusCode::kUnavailable:
     case absl::StatusCode::kDeadlineExceeded:
-    case absl::StatusCode::kResourceExhausted:
     case absl::StatusCode::kAborted:
       return kServiceExitTryAgain;
     default:

@@ -11,7 +11,8 @@ absl::Status CheckLimit(const Stats& stats, const std::string& what, uint64_t li
   const auto at = stats.counts.find(what);
   if (at == stats.counts.end() || at->second <= limit) return absl::OkStatus();
   return absl::ResourceExhaustedError("the scene has " + std::to_string(at->second) + " " + what +
-                                      ", the limit is " + std::to_string(limit));
+                                      ", the limit is " + std::to_string(limit) +
+                                      "; raise limits.max_" + what + " or take a smaller scene");
 }
 
 }  // namespace
@@ -81,9 +82,9 @@ absl::StatusOr<StoredBake> FrameBakery::Make(const JobSpec& spec, std::optional<
     asset.files.emplace(uri, *std::move(blob));
   }
   if (total > spec.limits.max_asset_bytes) {
-    return absl::ResourceExhaustedError("the asset has " + std::to_string(total) +
-                                        " bytes, the limit is " +
-                                        std::to_string(spec.limits.max_asset_bytes));
+    return absl::ResourceExhaustedError(
+        "the asset has " + std::to_string(total) + " bytes, the limit is " +
+        std::to_string(spec.limits.max_asset_bytes) + "; raise limits.max_asset_bytes");
   }
   FP_ASSIGN_OR_RETURN(BakeResult result, baker_->Bake(asset, spec, time_s, stop));
   StoredBake bake;

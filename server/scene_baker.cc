@@ -52,7 +52,9 @@ class CoreBaker final : public SceneBaker {
       ImportTimer timer(result.stats);
       FP_ASSIGN_OR_RETURN(imported, Import(asset, spec, time_s));
       result.made_up_camera = imported.scene.cameras.empty();
-      EnsureCameraAndLight(imported);
+      const SceneOverrides& o = spec.overrides;
+      EnsureCameraAndLight(imported, /*light_chosen=*/!o.suns.empty() || !o.lights.empty() ||
+                                         o.sky.has_value() || o.environment.has_value());
     }
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
 

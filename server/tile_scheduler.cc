@@ -617,7 +617,7 @@ SchedulerNews TileScheduler::Tick() {
     if (!job.started || job.paused_at || job.counts.queued + job.counts.leased == 0) continue;
     if (job.spec.max_time != Duration::max() && now - *job.started > job.spec.max_time) {
       FailJob(job,
-              absl::DeadlineExceededError("the job rendered longer than its limit of " +
+              absl::ResourceExhaustedError("the job rendered longer than its limit of " +
                                           SecondsText(job.spec.max_time) +
                                           "; raise limits.max_seconds or render less"),
               std::nullopt, news);

@@ -40,7 +40,7 @@ absl::Status FileError(const std::string& what, const std::string& path, int err
 
 absl::Status DiskError(const std::string& what, const std::string& path, int error) {
   const std::string text = ErrorText(what, path, error);
-  if (IsFull(error)) return absl::ResourceExhaustedError(text + "; free some space and try again");
+  if (IsFull(error)) return absl::UnavailableError(text + "; free some space and try again");
   return absl::UnavailableError(text);
 }
 

@@ -12,11 +12,11 @@
 
 namespace farpoint {
 
-// "`what` 'path': <the system's text>". kNotFound, kPermissionDenied, kResourceExhausted for a full
-// disk, else kUnavailable. `error` is an errno.
+// "`what` 'path': <the system's text>". kNotFound, kPermissionDenied, else kUnavailable.
+// `error` is an errno.
 absl::Status FileError(const std::string& what, const std::string& path, int error);
-// The same for a disk that should take something: kResourceExhausted if it is full, else
-// kUnavailable, whatever the cause.
+// The same for a disk that should take something: kUnavailable, whatever the cause; of a full disk
+// it says so.
 absl::Status DiskError(const std::string& what, const std::string& path, int error);
 
 // Closes on destruction.

@@ -3,9 +3,10 @@
 // "what went wrong, where; what to do".
 //
 // Codes and what callers make of them:
-//   kInvalidArgument, kNotFound, kFailedPrecondition, kOutOfRange, kUnimplemented, kDataLoss
+//   kInvalidArgument, kNotFound, kFailedPrecondition, kOutOfRange, kUnimplemented, kDataLoss,
+//   kResourceExhausted (a limit)
 //       permanent: the scene, the blob or the settings are wrong (exit code 42)
-//   kUnavailable, kDeadlineExceeded, kResourceExhausted, kAborted
+//   kUnavailable, kDeadlineExceeded, kAborted
 //       try again (exit code 75)
 #pragma once
 

@@ -39,7 +39,7 @@ struct RenderSettings {
   PixelFilter filter = PixelFilter::kBlackmanHarris;  // of no effect at spp 1
   float filter_width_px = 0;    // of its whole support, 0.01..16; 0: the filter's default
   uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
-  uint32_t light_samples = 32;  // shadow rays per receiver or surfel and light, 1..4096
+  uint32_t light_samples = 32;  // shadow rays per receiver, see docs/lights.md, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
   uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default
   BufferMap buffer_map = BufferMap::kOctahedral;

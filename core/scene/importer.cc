@@ -26,6 +26,12 @@ Box3d WorldBounds(const Scene& scene) {
   return bounds;
 }
 
+bool HasTriangles(const Scene& scene) {
+  return std::any_of(scene.instances.begin(), scene.instances.end(), [&](const Instance& instance) {
+    return !scene.meshes[instance.mesh].triangles.empty();
+  });
+}
+
 bool IsLit(const Scene& scene) {
   if (MaxComponent(scene.environment.sky) > 0) return true;
   for (const Rgb& texel : scene.environment.map) {
@@ -77,15 +83,18 @@ absl::StatusOr<std::optional<TimeRange>> FindAnimation(const AssetBundle& asset)
   return FindGltfAnimation(asset);
 }
 
-void EnsureCameraAndLight(ImportedScene& imported) {
+void EnsureCameraAndLight(ImportedScene& imported, bool light_chosen) {
   Scene& scene = imported.scene;
+  if (!HasTriangles(scene)) {
+    imported.notes.push_back("the scene has no triangles: the image shows its background only");
+  }
   if (scene.cameras.empty()) {
     scene.cameras.push_back(FramingCamera(WorldBounds(scene)));
     imported.notes.push_back(
         "no camera: one was placed that frames the whole scene; choose your "
         "own with --eye, --target and --fov");
   }
-  if (!IsLit(scene)) {
+  if (!light_chosen && !IsLit(scene)) {
     PunctualLight sun;
     sun.name = "sun";
     sun.kind = PunctualKind::kDirectional;

@@ -32,7 +32,7 @@ TEST(ServiceMain, RefusesOtherAddressesByFlagAndReason) {
 TEST(ServiceMain, ExitCodesTellWhetherToTryAgain) {
   EXPECT_EQ(ServiceExitCode(absl::OkStatus()), 0);
   EXPECT_EQ(ServiceExitCode(absl::UnavailableError("")), 75);
-  EXPECT_EQ(ServiceExitCode(absl::ResourceExhaustedError("")), 75);
+  EXPECT_EQ(ServiceExitCode(absl::ResourceExhaustedError("")), 42);
   EXPECT_EQ(ServiceExitCode(absl::FailedPreconditionError("")), 42);
   EXPECT_EQ(ReportFatal("test", absl::DataLossError("broken")), 42);
 }

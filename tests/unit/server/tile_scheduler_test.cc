@@ -385,7 +385,7 @@ TEST_F(TileSchedulerTest, AJobThatRunsTooLongFails) {
   clock_.Advance(seconds(2));
   const SchedulerNews news = scheduler_.Tick();
   ASSERT_EQ(news.failed.size(), 1u);
-  EXPECT_TRUE(absl::IsDeadlineExceeded(news.failed[0].error));
+  EXPECT_TRUE(absl::IsResourceExhausted(news.failed[0].error));
 }
 
 TEST_F(TileSchedulerTest, SilentIdleWorkersAreForgotten) {

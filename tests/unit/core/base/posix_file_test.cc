@@ -21,10 +21,10 @@ TEST(PosixFile, ErrorsNameThePathAndWhetherToTryAgain) {
   EXPECT_TRUE(absl::IsNotFound(missing));
   EXPECT_EQ(missing.message(), "cannot open '/a/b': No such file or directory");
   EXPECT_TRUE(absl::IsPermissionDenied(FileError("cannot open", "x", EACCES)));
-  EXPECT_TRUE(absl::IsResourceExhausted(FileError("cannot open", "x", ENOSPC)));
+  EXPECT_TRUE(absl::IsUnavailable(FileError("cannot open", "x", ENOSPC)));
   EXPECT_TRUE(absl::IsUnavailable(FileError("cannot open", "x", EIO)));
   EXPECT_TRUE(absl::IsUnavailable(DiskError("cannot write", "x", ENOENT)));
-  EXPECT_TRUE(absl::IsResourceExhausted(DiskError("cannot write", "x", EDQUOT)));
+  EXPECT_TRUE(absl::IsUnavailable(DiskError("cannot write", "x", EDQUOT)));
 }
 
 TEST(PosixFile, WritesInOrderAndAtOffsets) {

@@ -46,7 +46,7 @@ absl::StatusOr<std::string> ReadScene(const std::string& path, std::optional<dou
   ImportOptions options;
   options.time_s = time_s;
   FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, options));
-  EnsureCameraAndLight(imported);
+  EnsureCameraAndLight(imported, /*light_chosen=*/false);
   Executor executor(1);
   FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(imported.scene, executor));
   return std::to_string(prepared->triangles().size());

@@ -33,7 +33,7 @@ TEST(EnsureCameraAndLight, FramesEveryCornerOfTheScene) {
   imported.scene.cameras.clear();
   imported.scene.instances[0].world_from_mesh.column[0] = {30, 0, 0};
   imported.scene.instances[0].world_from_mesh.translation = {1e5, 20, -7};
-  EnsureCameraAndLight(imported);
+  EnsureCameraAndLight(imported, /*light_chosen=*/false);
   ASSERT_EQ(imported.scene.cameras.size(), 1u);
   ASSERT_EQ(imported.notes.size(), 1u);
   EXPECT_THAT(imported.notes[0], HasSubstr("no camera"));
@@ -52,15 +52,16 @@ TEST(EnsureCameraAndLight, FramesEveryCornerOfTheScene) {
 }
 
 TEST(EnsureCameraAndLight, LightsOnlyWhatIsDark) {
-  const auto notes_of = [](const Scene& scene) {
+  const auto notes_of = [](const Scene& scene, bool light_chosen = false) {
     ImportedScene imported;
     imported.scene = scene;
-    EnsureCameraAndLight(imported);
+    EnsureCameraAndLight(imported, light_chosen);
     return imported.notes;
   };
   Scene dark = MakeFurnace(0.5f, 0);
   ASSERT_EQ(notes_of(dark).size(), 1u);
   EXPECT_THAT(notes_of(dark)[0], HasSubstr("no light"));
+  EXPECT_THAT(notes_of(dark, /*light_chosen=*/true), IsEmpty());
   EXPECT_THAT(notes_of(MakeCornellBox()), IsEmpty());
   EXPECT_THAT(notes_of(MakeCity(1, 1)), IsEmpty());
   Scene sky = dark;
@@ -73,6 +74,9 @@ TEST(EnsureCameraAndLight, LightsOnlyWhatIsDark) {
   unused.materials.push_back(unused.materials[0]);
   unused.materials[1].emission = {1, 1, 1};
   EXPECT_THAT(notes_of(unused), testing::SizeIs(1));
+  Scene empty = MakeCornellBox();
+  empty.instances.clear();
+  EXPECT_THAT(notes_of(empty, true), testing::ElementsAre(HasSubstr("no triangles")));
 }
 
 }  // namespace
