@@ -618,8 +618,8 @@ SchedulerNews TileScheduler::Tick() {
     if (job.spec.max_time != Duration::max() && now - *job.started > job.spec.max_time) {
       FailJob(job,
               absl::ResourceExhaustedError("the job rendered longer than its limit of " +
-                                          SecondsText(job.spec.max_time) +
-                                          "; raise limits.max_seconds or render less"),
+                                           SecondsText(job.spec.max_time) +
+                                           "; raise limits.max_seconds or render less"),
               std::nullopt, news);
     }
   }

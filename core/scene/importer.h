@@ -52,8 +52,8 @@ absl::StatusOr<ImportedScene> ImportScene(const AssetBundle& asset, const Import
 absl::StatusOr<std::optional<TimeRange>> FindAnimation(const AssetBundle& asset);
 
 // Gives a scene without camera one that frames its bounding box, and a scene without any light
-// (punctual, emissive, sky, map) a sun and a sky; a note for each. `light_chosen`: the user chose the
-// light, and what is dark stays dark. A scene without triangles gets a note, too.
+// (punctual, emissive, sky, map) a sun and a sky; a note for each. `light_chosen`: the user chose
+// the light, and what is dark stays dark. A scene without triangles gets a note, too.
 void EnsureCameraAndLight(ImportedScene& imported, bool light_chosen);
 
 }  // namespace farpoint

@@ -21,8 +21,7 @@ TEST(ExitCode, IsPermanentForWhatTryingAgainWillNotCure) {
         absl::StatusCode::kFailedPrecondition, absl::StatusCode::kOutOfRange,
         absl::StatusCode::kUnimplemented, absl::StatusCode::kDataLoss,
         absl::StatusCode::kPermissionDenied, absl::StatusCode::kResourceExhausted,
-        absl::StatusCode::kCancelled,
-        absl::StatusCode::kInternal, absl::StatusCode::kUnknown}) {
+        absl::StatusCode::kCancelled, absl::StatusCode::kInternal, absl::StatusCode::kUnknown}) {
     EXPECT_EQ(ExitCodeOf(absl::Status(code, "x")), 42) << absl::StatusCodeToString(code);
   }
 }

@@ -612,7 +612,9 @@ TEST_F(FarmJobs, WhatHappensIsLoggedWithTimeTileAndWorker) {
   EXPECT_EQ(std::get<JobState>(events.back().body), JobState::kPaused);
   for (size_t i = 0; i < events.size(); ++i) {
     EXPECT_GT(events[i].unix_ms, 1'600'000'000'000);
-    if (i > 0) EXPECT_GE(events[i].unix_ms, events[i - 1].unix_ms);
+    if (i > 0) {
+      EXPECT_GE(events[i].unix_ms, events[i - 1].unix_ms);
+    }
   }
 }
 
@@ -679,8 +681,12 @@ TEST_P(RandomFarm, KeepsTheInvariants) {
       ASSERT_EQ(t.committed, committed[id].size());
       ASSERT_LE(status.frames.done, status.frames.baked);
       ASSERT_EQ(status.state == JobState::kDone, t.committed == t.total);
-      if (IsFinal(status.state)) ASSERT_EQ(t.leased, 0u);
-      if (status.state == JobState::kCancelled) ASSERT_EQ(t.failed, 0u);
+      if (IsFinal(status.state)) {
+        ASSERT_EQ(t.leased, 0u);
+      }
+      if (status.state == JobState::kCancelled) {
+        ASSERT_EQ(t.failed, 0u);
+      }
     }
   };
   const auto give = [&](const Held& h) {
@@ -706,11 +712,15 @@ TEST_P(RandomFarm, KeepsTheInvariants) {
         if (workers.size() < 4) workers.push_back(RegisterOrDie());
         break;
       case 2:
-        if (!jobs.empty()) ASSERT_TRUE(coordinator_->Pause(any(jobs)).ok());
+        if (!jobs.empty()) {
+          ASSERT_TRUE(coordinator_->Pause(any(jobs)).ok());
+        }
         break;
       case 3:
       case 4:
-        if (!jobs.empty()) ASSERT_TRUE(coordinator_->Resume(any(jobs)).ok());
+        if (!jobs.empty()) {
+          ASSERT_TRUE(coordinator_->Resume(any(jobs)).ok());
+        }
         break;
       case 5:
         if (!jobs.empty() && random() % 4 == 0) {
@@ -779,7 +789,9 @@ TEST_P(RandomFarm, KeepsTheInvariants) {
   for (int i = 0; i < 300 && !all_done(); ++i) {
     const auto work = coordinator_->Lease(worker, milliseconds(100));
     ASSERT_TRUE(work.ok());
-    if (work->has_value()) ASSERT_NO_FATAL_FAILURE(give({worker, **work}));
+    if (work->has_value()) {
+      ASSERT_NO_FATAL_FAILURE(give({worker, **work}));
+    }
     ASSERT_NO_FATAL_FAILURE(check());
   }
   EXPECT_TRUE(all_done());
