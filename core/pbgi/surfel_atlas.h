@@ -22,7 +22,8 @@ class SurfelGrid {
   explicit SurfelGrid(const PointTree& tree);
 
   // The radiance [W/(m² sr)] on the side of `n` (unit) of the nearest surfel within 1.5 spacings of
-  // `p` whose plane is within 60° of n's; none if there is none.
+  // `p` whose plane is within 60° of n's and passes within a tenth of a spacing of p; none if there
+  // is none.
   std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n) const;
 
   // sqrt(mean area of a surfel); 0 for an empty tree.
