@@ -11,8 +11,8 @@
 #include <string_view>
 
 #include "client/frame_range.h"
-#include "client/nearest_name.h"
 #include "core/base/blob.h"
+#include "core/base/nearest_name.h"
 
 namespace farpoint {
 namespace {

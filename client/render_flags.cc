@@ -8,7 +8,7 @@
 #include <limits>
 
 #include "client/frame_range.h"
-#include "client/nearest_name.h"
+#include "core/base/nearest_name.h"
 #include "core/image/layers.h"
 #include "core/scene/scene_format.h"
 

@@ -20,12 +20,6 @@ constexpr float kKernelSupport = 2.5f;
 // outlines of neighbours fit together, their squares do not: a little overlap evens out gaps, in
 // which energy is lost (Cornell: rr 0.069 to 0.061, bias -4.3 % to -3.7 % at the coarsest cut).
 constexpr float kCoverageBoxScale = 1.4f;
-// Splats of one surface leave gaps in some pixels and overlap in others, where the pixel is full
-// and the rest is lost: coverage comes out too low by a few per cent. A pixel covered beyond this
-// is read as full, at the price of outlines against nothing, which grow by 3 % of a pixel. Cornell,
-// 88,880 surfels, k = 100: rr 0.052 to 0.038, bias -2.9 % to -1.2 %; from 0.6 on rr 0.035, bias
-// -0.6 %, but a free disc of 115 pixels comes out 5 % too bright.
-constexpr float kFullFrom = 0.75f;
 // A pixel beyond kFullFrom takes nothing more that lies this much farther than what it took last:
 // that is another surface, behind the gaps of the one in front, and usually a darker one. Cornell,
 // k = 64: bias -1.6 % to -0.7 %; Sponza, pbgi, 1 M surfels, 128x100, against 2048 paths: rr 0.304

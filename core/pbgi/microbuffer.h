@@ -22,6 +22,13 @@
 
 namespace farpoint {
 
+// Splats of one surface leave gaps in some pixels and overlap in others, where the pixel is full
+// and the rest is lost: coverage comes out too low by a few per cent. A pixel covered beyond this
+// is read as full, at the price of outlines against nothing, which grow by 3 % of a pixel. Cornell,
+// 88,880 surfels, k = 100: rr 0.052 to 0.038, bias -2.9 % to -1.2 %; from 0.6 on rr 0.035, bias
+// -0.6 %, but a free disc of 115 pixels comes out 5 % too bright.
+inline constexpr float kFullFrom = 0.75f;
+
 // Radiance already weighted by coverage, coverage in [0, 1], a depth. Arrays
 // have map.padded() elements.
 class Microbuffer {

@@ -42,6 +42,8 @@ class StageClock {
     ticks_[static_cast<int>(stage)] += now - last_;
     last_ = now;
   }
+  // What ran since the last call is measured by somebody else.
+  void Skip() { last_ = __rdtsc(); }
   void Finish(Stats& stats) {
     const double total = static_cast<double>(std::max<uint64_t>(1, last_ - start_));
     const double cpu = ThreadCpuSeconds() - cpu_;
@@ -120,7 +122,9 @@ class Renderer final : public FrameRenderer {
     wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
-    gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
+    if (settings_.integrator == Integrator::kFpbgi) {
+      gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
+    }
     if (settings_.adaptive()) {
       hierarchy_ = std::make_unique<ReceiverHierarchy>(HierarchyOf(settings_), frame_.film.frame(),
                                                        *gatherer_);
@@ -244,11 +248,11 @@ class Renderer final : public FrameRenderer {
         TracePaths(block, samples, receivers, sample_of, wanted, n);
         clock.Charge(Stage::kTrace);
       } else if (view != nullptr) {
-        Blend(*view, block, samples, receivers, sample_of, wanted, n, stats);
+        Blend(*view, block, samples, receivers, sample_of, wanted, n, stats, clock);
         clock.Charge(Stage::kConvolve);
       } else {
         Gather(block, samples, receivers, sample_of, wanted, n, clock);
-        stats += gatherer_->TakeStats();
+        if (gatherer_) stats += gatherer_->TakeStats();
       }
     }
 
@@ -362,7 +366,7 @@ class Renderer final : public FrameRenderer {
   void Blend(const ReceiverHierarchy::View& view, const PixelRect& block,
              std::vector<Sample>& samples, const std::vector<Receiver>& receivers,
              const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
-             Counters& n, Stats& stats) const {
+             Counters& n, Stats& stats, StageClock& clock) const {
     constexpr int kSide = 8;
     constexpr int kAcross = kBlockSize / kSide;
     const uint32_t spp = settings_.spp;
@@ -431,9 +435,11 @@ class Renderer final : public FrameRenderer {
                                   static_cast<float>(y) + 0.5f};
       BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1});
       if (sample.weight >= hierarchy_->params().enough) continue;
+      clock.Charge(Stage::kConvolve);
       own.push_back(hierarchy_->MakeOwnRecord(
           served, rays_.FootprintAt(receivers[r].position),
           HashKey(static_cast<uint64_t>(x), static_cast<uint64_t>(y), sample_of[r] % spp)));
+      clock.Skip();
       own_list.push_back(&own.back());
       sample.indirect_e = own.back().gather.irradiance;
       ++n.clusters;
@@ -489,10 +495,12 @@ class Renderer final : public FrameRenderer {
       if (!any) continue;
       ++n.clusters;
       if (by_rays) {
+        clock.Charge(Stage::kConvolve);
         const GatherRecord record =
             gatherer_->Gather(receivers[cluster.active], ray_grid_,
                               HashKey(PixelKey(block, sample_of[cluster.active], kKeyCluster),
                                       sample_of[cluster.active] % settings_.spp));
+        clock.Skip();
         for (const uint32_t r : cluster.members) {
           if (!wanted[r]) continue;
           Sample& sample = samples[sample_of[r]];

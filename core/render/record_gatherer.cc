@@ -13,8 +13,6 @@ namespace {
 
 // Below this many surfel spacings from the receiver a hit is shaded afresh.
 constexpr float kNearSpacings = 2.0f;
-// A microbuffer's pixel covered beyond this is read as full (core/pbgi/microbuffer.cc).
-constexpr float kFullFrom = 0.75f;
 enum : uint64_t { kKeyDirections = 31, kKeyLight = 32 };
 
 }  // namespace
@@ -125,7 +123,6 @@ GatherRecord RecordGatherer::GatherByCut(const Receiver& receiver,
   CutView view;
   view.position = receiver.position;
   view.normal = receiver.normal;
-  view.cos_spread = 1;
   view.sees_inside = receiver.on_back;
   std::vector<CutNode> cut, scratch;
   CutCounters cut_counters;

@@ -1,4 +1,4 @@
-#include "client/nearest_name.h"
+#include "core/base/nearest_name.h"
 
 #include <gtest/gtest.h>
 

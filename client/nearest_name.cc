@@ -1,1 +1,0 @@
-#include "client/nearest_name.h"
