@@ -8,6 +8,7 @@
 #include <chrono>
 #include <functional>
 #include <memory>
+#include <mutex>
 #include <thread>
 
 #include "proto/convert.h"
@@ -22,9 +23,9 @@ using testing::HasSubstr;
 // Says what a test tells it to say.
 class FakeJobs final : public v1::JobService::Service {
  public:
-  std::vector<v1::TileChunk> chunks;
+  std::mutex mutex;
+  std::vector<v1::TileChunk> chunks;  // change it under `mutex`
   v1::SubmitRequest submitted;
-  std::atomic<bool> watching{false};
   std::vector<std::string> told;
 
   grpc::Status Submit(grpc::ServerContext*, const v1::SubmitRequest* request,
@@ -71,13 +72,20 @@ class FakeJobs final : public v1::JobService::Service {
     event.body = std::string("a note");
     event.status.id = JobId{"0badcafe"};
     writer->Write(ToWire(event));
-    watching = true;
     while (!context->IsCancelled()) std::this_thread::sleep_for(std::chrono::milliseconds(5));
     return grpc::Status::CANCELLED;
   }
   grpc::Status FetchTiles(grpc::ServerContext*, const v1::FetchTilesRequest*,
                           grpc::ServerWriter<v1::TileChunk>* writer) override {
-    for (const v1::TileChunk& chunk : chunks) writer->Write(chunk);
+    // A copy: a client that gives up returns while this still writes, and the test goes on.
+    std::vector<v1::TileChunk> sent;
+    {
+      std::lock_guard lock(mutex);
+      sent = chunks;
+    }
+    for (const v1::TileChunk& chunk : sent) {
+      if (!writer->Write(chunk)) break;
+    }
     return grpc::Status::OK;
   }
 };
@@ -213,14 +221,16 @@ TEST_F(GrpcFarmLinkTest, TheLibraryWritesNothingOnItsOwn) {
 
 TEST_F(GrpcFarmLinkTest, ASignalEndsAWatch) {
   std::vector<uint64_t> sequences;
+  std::atomic<bool> received{false};  // a signal before the event could overtake it
   std::thread raiser([&] {
-    for (int i = 0; i < 1000 && !jobs_.watching; ++i) {
+    for (int i = 0; i < 1000 && !received; ++i) {
       std::this_thread::sleep_for(std::chrono::milliseconds(5));
     }
     stop_.Raise(2);
   });
   const absl::Status status = link_->Watch(JobId{"1"}, 41, [&](const JobEvent& event) {
     sequences.push_back(event.sequence);
+    received = true;
     return absl::OkStatus();
   });
   raiser.join();
@@ -294,8 +304,11 @@ TEST_F(GrpcFarmLinkTest, RefusesPiecesThatDoNotFit) {
       [](auto& chunks) { chunks[1].clear_data(); },
   };
   for (size_t i = 0; i < damages.size(); ++i) {
-    jobs_.chunks = good;
-    damages[i](jobs_.chunks);
+    {
+      std::lock_guard lock(jobs_.mutex);
+      jobs_.chunks = good;
+      damages[i](jobs_.chunks);
+    }
     std::vector<TileData> tiles;
     EXPECT_FALSE(Fetch(&tiles).ok()) << i;
     EXPECT_TRUE(tiles.empty()) << i;
