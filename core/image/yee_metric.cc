@@ -1,6 +1,7 @@
 #include "core/image/yee_metric.h"
 
 #include <cmath>
+#include <numeric>
 #include <vector>
 
 #include "core/base/check.h"
@@ -94,8 +95,9 @@ double ThresholdVersusIntensity(double adaptation_cd_m2) {
 
 }  // namespace
 
-int64_t CountPerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
-                                  std::span<const uint8_t> mask, const YeeViewing& viewing) {
+std::vector<uint8_t> PerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
+                                          std::span<const uint8_t> mask,
+                                          const YeeViewing& viewing) {
   FP_CHECK(a[0].width == b[0].width && a[0].height == b[0].height);
   FP_CHECK(mask.size() == a[0].values.size());
   const std::vector<ImagePlane> la = LuminanceStack(a, viewing.white_cd_m2);
@@ -116,7 +118,7 @@ int64_t CountPerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
     frequency_factor[i] = most_sensitive / ContrastSensitivity(frequency_cpd[i], 100.0);
   }
 
-  int64_t count = 0;
+  std::vector<uint8_t> differs(mask.size());
   for (size_t p = 0; p < mask.size(); ++p) {
     if (mask[p] == 0) continue;
     const double delta = std::abs(double{la[0].values[p]} - lb[0].values[p]);
@@ -141,15 +143,21 @@ int64_t CountPerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
     factor = std::clamp(factor / std::max(contrast_sum, kTiny), 1.0, 10.0);
 
     if (delta > factor * ThresholdVersusIntensity(adaptation)) {
-      ++count;
+      differs[p] = 1;
       continue;
     }
     const double ramp = std::min(1.0, adaptation / 10.0);
     const Chroma ca = ChromaOf(a, p), cb = ChromaOf(b, p);
     const double da = ca.a - cb.a, db = ca.b - cb.b;
-    if ((da * da + db * db) * (ramp * ramp) > factor) ++count;
+    if ((da * da + db * db) * (ramp * ramp) > factor) differs[p] = 1;
   }
-  return count;
+  return differs;
+}
+
+int64_t CountPerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
+                                  std::span<const uint8_t> mask, const YeeViewing& viewing) {
+  const std::vector<uint8_t> differs = PerceptiblyDifferent(a, b, mask, viewing);
+  return std::accumulate(differs.begin(), differs.end(), int64_t{0});
 }
 
 }  // namespace farpoint

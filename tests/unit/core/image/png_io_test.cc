@@ -5,6 +5,9 @@
 
 #include <cstring>
 #include <filesystem>
+#include <fstream>
+#include <iterator>
+#include <string>
 #include <vector>
 
 #include "core/image/exr_io.h"
@@ -43,8 +46,21 @@ TEST_F(PngIo, RoundTrips) {
   EXPECT_EQ(d.rgb, rgb);
 }
 
+TEST_F(PngIo, EncodedBytesAreThoseOfTheFile) {
+  const std::vector<uint8_t> rgb(size_t{3} * 7 * 2, 0x5a);
+  const auto bytes = EncodePng(7, 2, rgb);
+  ASSERT_TRUE(bytes.ok()) << bytes.status();
+  ASSERT_TRUE(WritePng(Path("f.png"), 7, 2, rgb).ok());
+  std::ifstream file(Path("f.png"), std::ios::binary);
+  const std::string text{std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
+  ASSERT_EQ(text.size(), bytes->size());
+  EXPECT_EQ(std::memcmp(text.data(), bytes->data(), text.size()), 0);
+}
+
 TEST_F(PngIo, RefusesWrongSizes) {
   const std::vector<uint8_t> rgb(12);
+  EXPECT_FALSE(EncodePng(3, 2, rgb).ok());
+  EXPECT_FALSE(EncodePng(0, 0, {}).ok());
   EXPECT_FALSE(WritePng(Path("f.png"), 3, 2, rgb).ok());
   EXPECT_FALSE(WritePng(Path("f.png"), 0, 0, {}).ok());
   EXPECT_EQ(WritePng(Path("no/f.png"), 2, 2, rgb).code(), absl::StatusCode::kNotFound);

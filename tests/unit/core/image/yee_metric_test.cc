@@ -70,6 +70,22 @@ TEST(Yee, ContrastMasks) {
   EXPECT_LT(Count(busy, busy_brighter), kSize * kSize / 4);
 }
 
+TEST(Yee, MapMarksWhereTheImagesDiffer) {
+  const RgbImage a = Constant(0.5f, 0.5f, 0.5f);
+  RgbImage b = a;
+  for (ImagePlane& plane : b) plane.Row(kSize / 2)[kSize / 2] = 0.9f;
+  std::vector<uint8_t> mask(a[0].values.size(), 1);
+  const size_t centre = static_cast<size_t>(kSize / 2) * kSize + kSize / 2;
+  std::vector<uint8_t> differs = PerceptiblyDifferent(a, b, mask, {});
+  EXPECT_EQ(differs[centre], 1);
+  EXPECT_EQ(differs[0], 0);
+  EXPECT_EQ(std::count(differs.begin(), differs.end(), 1),
+            CountPerceptiblyDifferent(a, b, mask, {}));
+  mask[centre] = 0;
+  differs = PerceptiblyDifferent(a, b, mask, {});
+  EXPECT_EQ(differs[centre], 0);
+}
+
 TEST(Yee, IsSymmetricAndCountsTheMaskOnly) {
   RgbImage a = Constant(0.3f, 0.4f, 0.5f), b = a;
   for (size_t i = 0; i < a[0].values.size(); ++i) {
