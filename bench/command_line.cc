@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <charconv>
+#include <cstdlib>
 #include <string_view>
 
 #include "bench/text.h"
@@ -49,8 +50,8 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   line.output_dir = "out/bench";
   if (!args.empty() &&
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
-    return absl::UnimplementedError("'" + args.front() +
-                                    "' is not built yet; use pareto, rebake, lights or micro");
+    return absl::UnimplementedError(
+        "'" + args.front() + "' is not built yet; use accuracy, pareto, rebake, lights or micro");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -140,6 +141,43 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->check(CLI::Range(1u, 1u << 24));
   lights->add_option("--seed", l.seed, "Of every random choice")->capture_default_str();
 
+  AccuracyOptions& a = line.accuracy;
+  std::string quality(NameOf(a.quality)), fill(NameOf(a.fill));
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) a.folders.scenes = scenes;
+  CLI::App* accuracy = app.add_subcommand(
+      "accuracy", "Error of the default image by scene; writes accuracy.json and accuracy.html");
+  AddCommonOptions(*accuracy, line.output_dir, a.quick);
+  accuracy->add_option("--case", a.cases, "Only this one; may be given more than once");
+  accuracy->add_option(
+      "--scenes", a.folders.scenes,
+      "Folder of scenes of others [FARPOINT_SCENES; without one they are left out]");
+  accuracy->add_option("--references", a.folders.references,
+                       "Folder with cornell.gltf and its published reference");
+  accuracy->add_option("--reference-dir", a.reference_dir,
+                       "Folder that keeps traced references from run to run");
+  accuracy->add_option("--reference-pixels", a.reference_pixels, "Pixels of a traced reference")
+      ->capture_default_str()
+      ->check(CLI::Range(size_t{16}, size_t{1} << 20));
+  accuracy
+      ->add_option("--reference-budget", a.reference_budget_s,
+                   "Thread-seconds for each traced reference")
+      ->capture_default_str()
+      ->check(CLI::Range(0.0, 1e6));
+  accuracy->add_option("--quality", quality, "draft, normal or fine")->capture_default_str();
+  accuracy->add_option("--clusters", a.clusters, "k per block [0: adaptive]")
+      ->check(CLI::Range(0, 1024));
+  accuracy->add_option("--fill", fill, "auto, rays or cut")->capture_default_str();
+  accuracy->add_option("--points", a.points, "Surfels [by the scene, quick: 20000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  accuracy->add_option("--light-samples", a.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  accuracy->add_option("--seed", a.seed, "Of every random choice of the measured image")
+      ->capture_default_str();
+  accuracy->add_option("--threads", a.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -158,10 +196,17 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   } catch (const CLI::ParseError& error) {
     return absl::InvalidArgumentError(std::string(error.what()) + "; see farpoint-bench --help");
   }
-  line.verb = pareto->parsed()   ? BenchVerb::kPareto
-              : rebake->parsed() ? BenchVerb::kRebake
-              : lights->parsed() ? BenchVerb::kLights
-                                 : BenchVerb::kMicro;
+  line.verb = pareto->parsed()     ? BenchVerb::kPareto
+              : rebake->parsed()   ? BenchVerb::kRebake
+              : lights->parsed()   ? BenchVerb::kLights
+              : accuracy->parsed() ? BenchVerb::kAccuracy
+                                   : BenchVerb::kMicro;
+  const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
+  if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
+  a.quality = *asked_quality;
+  const absl::StatusOr<Fill> asked_fill = FillFromName(fill);
+  if (!asked_fill.ok()) return Annotate(asked_fill.status(), "--fill");
+  a.fill = *asked_fill;
   r.cache_bytes = cache_mib << 20;
   if (!sun.empty()) {
     const size_t colon = sun.find(':');

@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "bench/accuracy.h"
 #include "bench/lights.h"
 #include "bench/micro.h"
 #include "bench/pareto.h"
@@ -13,7 +14,7 @@
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -22,6 +23,7 @@ struct BenchCommandLine {
   ParetoOptions pareto;
   RebakeOptions rebake;
   LightsOptions lights;
+  AccuracyOptions accuracy;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

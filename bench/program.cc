@@ -5,9 +5,11 @@
 #include <span>
 #include <string_view>
 
+#include "bench/accuracy_report.h"
 #include "bench/command_line.h"
 #include "bench/pareto_report.h"
 #include "core/base/blob.h"
+#include "core/image/png_io.h"
 
 namespace farpoint {
 
@@ -40,6 +42,32 @@ absl::Status Pareto(const BenchCommandLine& line, std::ostream& out, std::ostrea
   out << ParetoTable(report) << "\n"
       << (dir / "pareto.json").string() << "\n"
       << (dir / "pareto.html").string() << "\n";
+  return absl::OkStatus();
+}
+
+absl::Status Accuracy(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "accuracy.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const AccuracyReport report,
+                      RunAccuracy(line.accuracy, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_ASSIGN_OR_RETURN(const std::string html, AccuracyHtml(report));
+  for (const AccuracyResult& result : report.results) {
+    for (const AccuracyPicture& picture : result.pictures) {
+      FP_RETURN_IF_ERROR(
+          WritePng((dir / picture.file).string(), picture.width, picture.height, picture.rgb));
+    }
+  }
+  FP_RETURN_IF_ERROR(WriteText(dir / "accuracy.json", AccuracyJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "accuracy.html", html));
+  out << AccuracyTable(report) << "\n"
+      << (dir / "accuracy.json").string() << "\n"
+      << (dir / "accuracy.html").string() << "\n";
   return absl::OkStatus();
 }
 
@@ -85,6 +113,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Rebake(line, out, err);
     case BenchVerb::kLights:
       return Lights(line, out, err);
+    case BenchVerb::kAccuracy:
+      return Accuracy(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
