@@ -81,6 +81,8 @@ std::vector<AccuracyCase> AccuracyCases(bool quick) {
   AccuracyCase macross = Plain("macross", "macross_city/macross_city.gltf", 0.06, 0.015);
   macross.sun = AccuracySun{{0.5, 1, 0.4}, Rgb(8, 8, 7)};
   macross.sky = Rgb(0.4f, 0.5f, 0.7f);
+  // Along the street towards the houses, figures near and far.
+  macross.view = AccuracyView{{2.4, 0.5, 2.6}, {0, -0.25, -0.2}, 40};
   cases.push_back(macross);
   cases.push_back(Plain("city", "city", 0.05, 0.01));
   cases.push_back(Plain("furnace", "furnace", 0.01, 0.003));
