@@ -99,14 +99,12 @@ absl::Status ParseChoice(std::string_view text, const Choice<T> (&choices)[N], T
 }
 
 absl::Status ApplyIntegrator(std::string_view value, JobEdit& edit) {
-  if (value == "irrcache") {
-    return Bad("the irradiance cache is not built yet; use fpbgi, pbgi, dpbgi or pt");
-  }
   return ParseChoice(value,
                      {Choice<Integrator>{"fpbgi", Integrator::kFpbgi},
                       {"pbgi", Integrator::kPbgi},
                       {"dpbgi", Integrator::kDpbgi},
-                      {"pt", Integrator::kPt}},
+                      {"pt", Integrator::kPt},
+                      {"irrcache", Integrator::kIrrcache}},
                      edit.spec.settings.integrator);
 }
 
@@ -323,7 +321,9 @@ constexpr RenderFlag kRenderFlags[] = {
      }},
     {"--integrator", "NAME", kMethod,
      "fpbgi (factorized point-based GI, the default), pbgi (every receiver alone), dpbgi (pbgi "
-     "with a smaller buffer) or pt (path tracing, the ground truth)",
+     "with a smaller buffer), pt (path tracing, the ground truth) or irrcache (an irradiance "
+     "cache, "
+     "to compare with: each worker makes that of the whole frame, whatever tiles it gets)",
      ApplyIntegrator},
     {"--resolution", "WxH", kImage, "size of the whole frame in pixels; default 1280x720",
      ApplyResolution},
@@ -413,10 +413,27 @@ constexpr RenderFlag kRenderFlags[] = {
        return absl::OkStatus();
      }},
     {"--quality", "LEVEL", kMethod,
-     "fpbgi, adaptive clusters: the error to aim at: draft, normal (the default) or fine",
+     "fpbgi, adaptive clusters, and irrcache: the error to aim at: draft, normal (the default) or "
+     "fine",
      [](std::string_view value, JobEdit& edit) {
        FP_ASSIGN_OR_RETURN(edit.spec.settings.quality, QualityFromName(value));
        return absl::OkStatus();
+     }},
+    {"--cache-error", "A", kMethod,
+     "irrcache: a record's reach over the mean distance of what it sees, 0.01..10; default 0: by "
+     "--quality",
+     [](std::string_view value, JobEdit& edit) {
+       double error = 0;
+       if (!ParseFinite(value, error) || (error != 0 && (error < 0.01 || error > 10))) {
+         return Bad("expected 0 or a number from 0.01 to 10");
+       }
+       edit.spec.settings.cache_error = static_cast<float>(error);
+       return absl::OkStatus();
+     }},
+    {"--cache-samples", "N", kMethod,
+     "irrcache: rays of a record, 4..1048576; default 0: by --quality",
+     [](std::string_view value, JobEdit& edit) {
+       return ParseCount(value, edit.spec.settings.cache_samples);
      }},
     {"--epsilon", "E", kMethod, "fpbgi: nodes are far where R_cluster < E (d - r); default 0.2",
      [](std::string_view value, JobEdit& edit) {

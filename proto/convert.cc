@@ -460,6 +460,9 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
     case v1::INTEGRATOR_PT:
       settings.integrator = Integrator::kPt;
       break;
+    case v1::INTEGRATOR_IRRCACHE:
+      settings.integrator = Integrator::kIrrcache;
+      break;
     default:
       return Bad(Path(field, "integrator"), std::to_string(wire.integrator()),
                  "a value of Integrator");
@@ -544,6 +547,8 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
   if (wire.has_points()) settings.points = wire.points();
   if (wire.has_microbuffer_px()) settings.microbuffer = wire.microbuffer_px();
   if (wire.has_clusters()) settings.clusters = wire.clusters();
+  if (wire.has_cache_error()) settings.cache_error = wire.cache_error();
+  if (wire.has_cache_samples()) settings.cache_samples = wire.cache_samples();
   if (wire.has_epsilon()) settings.epsilon = wire.epsilon();
   if (wire.has_normal_weight()) settings.normal_weight = wire.normal_weight();
   if (wire.has_kmeans_iterations()) settings.kmeans_iterations = wire.kmeans_iterations();
@@ -580,6 +585,9 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
       break;
     case Integrator::kPt:
       wire.set_integrator(v1::INTEGRATOR_PT);
+      break;
+    case Integrator::kIrrcache:
+      wire.set_integrator(v1::INTEGRATOR_IRRCACHE);
       break;
   }
   wire.set_buffer_map(settings.buffer_map == BufferMap::kCosine ? v1::BUFFER_MAP_COSINE
@@ -628,6 +636,8 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
   wire.set_points(settings.points);
   wire.set_microbuffer_px(settings.microbuffer);
   wire.set_clusters(settings.clusters);
+  wire.set_cache_error(settings.cache_error);
+  wire.set_cache_samples(settings.cache_samples);
   wire.set_epsilon(settings.epsilon);
   wire.set_normal_weight(settings.normal_weight);
   wire.set_kmeans_iterations(settings.kmeans_iterations);

@@ -61,7 +61,7 @@ class CoreBaker final : public SceneBaker {
     BakeOptions options;
     options.cache = &cache_;
     options.cancel = &cancel;
-    if (time_s && imported.animation && spec.settings.integrator != Integrator::kPt) {
+    if (time_s && imported.animation && spec.settings.point_based()) {
       ImportTimer timer(result.stats);
       FP_ASSIGN_OR_RETURN(options.surfel_spacing_m, SpacingAtRest(asset, spec));
       FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
@@ -118,10 +118,10 @@ Digest BakeKey(const JobSpec& spec) {
   relevant.overrides = spec.overrides;
   relevant.light_units = spec.light_units;
   relevant.settings = spec.settings;
-  // What only tiles need. fpbgi, pbgi and dpbgi share surfels and tree; pt has none.
+  // What only tiles need. fpbgi, pbgi and dpbgi share surfels and tree; pt and irrcache have none.
   RenderSettings& s = relevant.settings;
   const RenderSettings any;
-  if (s.integrator != Integrator::kPt) s.integrator = any.integrator;
+  s.integrator = s.point_based() ? any.integrator : Integrator::kPt;
   s.spp = any.spp;
   s.filter = any.filter;
   s.filter_width_px = any.filter_width_px;
@@ -132,6 +132,8 @@ Digest BakeKey(const JobSpec& spec) {
   s.clusters = any.clusters;
   s.fill = any.fill;
   s.quality = any.quality;
+  s.cache_error = any.cache_error;
+  s.cache_samples = any.cache_samples;
   s.epsilon = any.epsilon;
   s.normal_weight = any.normal_weight;
   s.kmeans_iterations = any.kmeans_iterations;

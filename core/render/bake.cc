@@ -287,7 +287,7 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
   }
   stats.counts["triangles"] = prepared->triangles().size();
   stats.bytes["scene"] = baked.prepared_scene.size();
-  if (settings.integrator == Integrator::kPt) return baked;
+  if (!settings.point_based()) return baked;
   FP_RETURN_IF_ERROR(
       TreeBake(scene, std::move(prepared), settings, options, executor, stats).Run(baked));
   return baked;

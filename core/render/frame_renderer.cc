@@ -9,6 +9,7 @@
 #include <optional>
 
 #include "core/base/clock.h"
+#include "core/irrcache/irradiance_cache.h"
 #include "core/math/sampling.h"
 #include "core/pbgi/microbuffer.h"
 #include "core/pbgi/microbuffer_map.h"
@@ -60,7 +61,7 @@ class StageClock {
 
 struct Counters {
   uint64_t receivers = 0, clusters = 0, cut_nodes = 0, rays = 0, node_visits = 0, splats = 0;
-  uint64_t exact_discs = 0;
+  uint64_t exact_discs = 0, own_records = 0;
   uint64_t skipped_no_receivers = 0, skipped_black = 0, skipped_unlit = 0, skipped_shadow = 0;
   uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
 };
@@ -98,6 +99,16 @@ HierarchyParams HierarchyOf(const RenderSettings& settings) {
   return p;
 }
 
+IrradianceCacheParams CacheOf(const RenderSettings& settings) {
+  IrradianceCacheParams p;
+  p.seed = settings.seed;
+  p.error = settings.cache_error_in_force();
+  // A finer cache is finer in corners too.
+  p.least_px = std::clamp(20 * p.error, 1.5f, 6.0f);
+  p.samples = settings.cache_samples_in_force();
+  return p;
+}
+
 class Renderer final : public FrameRenderer {
  public:
   Renderer(std::shared_ptr<const LoadedScene> scene, const FrameSpec& frame)
@@ -122,7 +133,8 @@ class Renderer final : public FrameRenderer {
     wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
-    if (settings_.integrator == Integrator::kFpbgi) {
+    if (settings_.integrator == Integrator::kFpbgi ||
+        settings_.integrator == Integrator::kIrrcache) {
       gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
     }
     if (settings_.adaptive()) {
@@ -146,18 +158,19 @@ class Renderer final : public FrameRenderer {
     std::atomic<bool> finite{true}, cancelled{false};
     std::mutex progress_mutex;
     int done = 0;
-    const int total = static_cast<int>(blocks.size()) * (hierarchy_ ? 2 : 1);
+    const bool in_two_halves = hierarchy_ != nullptr || NeedsCache();
+    const int total = static_cast<int>(blocks.size()) * (in_two_halves ? 2 : 1);
+    int reported = 0;
+    const auto go_on = [&](double part) {
+      if (progress) {
+        const std::lock_guard lock(progress_mutex);
+        const int now = static_cast<int>(part * static_cast<double>(blocks.size()));
+        if (now > reported) progress(reported = now, total);
+      }
+      return cancel == nullptr || !cancel->load(std::memory_order_relaxed);
+    };
     std::shared_ptr<const ReceiverHierarchy::View> view;
     if (NeedsHierarchy()) {
-      int reported = 0;
-      const auto go_on = [&](double part) {
-        if (progress) {
-          const std::lock_guard lock(progress_mutex);
-          const int now = static_cast<int>(part * static_cast<double>(blocks.size()));
-          if (now > reported) progress(reported = now, total);
-        }
-        return cancel == nullptr || !cancel->load(std::memory_order_relaxed);
-      };
       const double cpu = ProcessCpuSeconds();
       ReceiverHierarchy::Counts counts;
       view = hierarchy_->Prepare(tile, executor, go_on, counts);
@@ -173,13 +186,19 @@ class Renderer final : public FrameRenderer {
       stats.counts["cluster_samples"] += counts.samples;
       out.stats += stats;
     }
-    if (hierarchy_) done = static_cast<int>(blocks.size());
+    const IrradianceCache* cache = nullptr;
+    if (NeedsCache()) {
+      cache = Cache(executor, go_on, out.stats);
+      if (cache == nullptr) return absl::CancelledError("the tile was cancelled");
+    }
+    if (in_two_halves) done = static_cast<int>(blocks.size());
     executor.ForEach(blocks.size(), 1, [&](size_t i) {
       if (cancel != nullptr && cancel->load(std::memory_order_relaxed)) {
         cancelled = true;
         return;
       }
-      if (!RenderBlock(blocks[i], tile, view.get(), out.film, block_stats[i])) finite = false;
+      if (!RenderBlock(blocks[i], tile, view.get(), cache, out.film, block_stats[i]))
+        finite = false;
       if (progress) {
         const std::lock_guard lock(progress_mutex);
         progress(++done, total);
@@ -206,7 +225,8 @@ class Renderer final : public FrameRenderer {
  private:
   // False if a value is not finite.
   bool RenderBlock(const PixelRect& block, const PixelRect& tile,
-                   const ReceiverHierarchy::View* view, Film& film, Stats& stats) const {
+                   const ReceiverHierarchy::View* view, const IrradianceCache* cache, Film& film,
+                   Stats& stats) const {
     StageClock clock;
     Counters n;
     const uint32_t spp = settings_.spp;
@@ -247,6 +267,13 @@ class Renderer final : public FrameRenderer {
       if (settings_.integrator == Integrator::kPt) {
         TracePaths(block, samples, receivers, sample_of, wanted, n);
         clock.Charge(Stage::kTrace);
+      } else if (settings_.integrator == Integrator::kIrrcache) {
+        if (cache != nullptr) {
+          Interpolate(*cache, block, samples, receivers, sample_of, wanted, n, stats, clock);
+        } else {
+          n.skipped_unlit += receivers.size();
+        }
+        clock.Charge(Stage::kConvolve);
       } else if (view != nullptr) {
         Blend(*view, block, samples, receivers, sample_of, wanted, n, stats, clock);
         clock.Charge(Stage::kConvolve);
@@ -360,6 +387,64 @@ class Renderer final : public FrameRenderer {
   bool NeedsHierarchy() const {
     return hierarchy_ != nullptr && wants_indirect_ &&
            (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
+  }
+
+  // Without light there is nothing to cache.
+  bool NeedsCache() const {
+    return settings_.integrator == Integrator::kIrrcache && wants_indirect_ &&
+           (settings_.no_skip || scene_.lights->any_light());
+  }
+
+  // The cache of the whole frame, made by the first tile that asks; others wait for it. Null:
+  // `go_on` said no, and the next one begins again.
+  const IrradianceCache* Cache(Executor& executor, const std::function<bool(double)>& go_on,
+                               Stats& stats) const {
+    const std::lock_guard lock(cache_mutex_);
+    if (cache_) return cache_.get();
+    const double cpu = ProcessCpuSeconds();
+    IrradianceCache::Counts counts;
+    cache_ = IrradianceCache::Build(CacheOf(settings_), frame_.film.frame(), scene_.scene->bounds(),
+                                    rays_.eye(), *gatherer_, executor, go_on, counts);
+    Stats gathers = gatherer_->TakeStats();
+    double gathering = 0;
+    for (const double s : gathers.seconds) gathering += s;
+    gathers.seconds[static_cast<int>(Stage::kCluster)] +=
+        std::max(0.0, ProcessCpuSeconds() - cpu - gathering);
+    gathers.counts["cache_candidates"] += counts.candidates;
+    gathers.counts["cache_records"] += counts.records;
+    gathers.counts["cache_samples"] += counts.samples;
+    stats += gathers;
+    return cache_.get();
+  }
+
+  // The irradiance cache: receivers interpolate its records; where none weighs they get their own,
+  // which samples of a pixel share.
+  void Interpolate(const IrradianceCache& cache, const PixelRect& block,
+                   std::vector<Sample>& samples, const std::vector<Receiver>& receivers,
+                   const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
+                   Counters& n, Stats& stats, StageClock& clock) const {
+    std::vector<GatherRecord> own;
+    for (uint32_t r = 0; r < receivers.size(); ++r) {
+      if (r == 0 || sample_of[r] / settings_.spp != sample_of[r - 1] / settings_.spp) own.clear();
+      if (!wanted[r]) continue;
+      Sample& sample = samples[sample_of[r]];
+      const Receiver& receiver = receivers[r];
+      CachedIrradiance e = cache.Interpolate(receiver.position, receiver.normal);
+      if (!(e.weight >= kServed)) {
+        e = InterpolateAll(own, receiver.position, receiver.normal);
+        if (!(e.weight >= cache.params().enough)) {
+          clock.Charge(Stage::kConvolve);
+          own.push_back(cache.MakeOwnRecord(
+              receiver, rays_.FootprintAt(receiver.position),
+              HashKey(PixelKey(block, sample_of[r], kKeyCluster), sample_of[r] % settings_.spp)));
+          clock.Skip();
+          e.irradiance = own.back().irradiance;
+          ++n.own_records;
+        }
+      }
+      sample.indirect_e = e.irradiance;
+    }
+    stats += gatherer_->TakeStats();
   }
 
   // Adaptive clusters: receivers blend the records about them.
@@ -688,6 +773,7 @@ class Renderer final : public FrameRenderer {
     stats.counts["node_visits"] += n.node_visits;
     stats.counts["splats"] += n.splats;
     stats.counts["exact_discs"] += n.exact_discs;
+    stats.counts["cache_records"] += n.own_records;
     stats.skipped["blocks_without_receivers"] += n.skipped_no_receivers;
     stats.skipped["black_receivers"] += n.skipped_black;
     stats.skipped["unlit_receivers"] += n.skipped_unlit;
@@ -708,6 +794,8 @@ class Renderer final : public FrameRenderer {
   CutParams cut_params_;
   std::unique_ptr<RecordGatherer> gatherer_;
   std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
+  mutable std::mutex cache_mutex_;
+  mutable std::unique_ptr<const IrradianceCache> cache_;  // irrcache
   bool wants_cluster_;
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
 };
@@ -748,8 +836,7 @@ absl::StatusOr<std::unique_ptr<FrameRenderer>> FrameRenderer::Create(
     return absl::InvalidArgumentError(
         "camera: the vertical field of view must lie between 0 and 177 degrees");
   }
-  if (frame.settings.integrator != Integrator::kPt &&
-      static_cast<const LoadedSceneData&>(*scene).tree == nullptr) {
+  if (frame.settings.point_based() && static_cast<const LoadedSceneData&>(*scene).tree == nullptr) {
     return absl::FailedPreconditionError(
         "a point-based integrator needs a point tree, and the scene was baked without one");
   }

@@ -34,7 +34,8 @@ RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& r
                                const RenderSettings& settings, const MicrobufferMap& map,
                                const CutParams& cut_params)
     : scene_(scene), rays_(rays), settings_(settings), map_(map), cut_params_(cut_params) {
-  if (settings.fill_in_force() == Fill::kRays && scene.tree != nullptr && !scene.tree->empty()) {
+  if (settings.point_based() && settings.fill_in_force() == Fill::kRays && scene.tree != nullptr &&
+      !scene.tree->empty()) {
     atlas_ = &scene.Atlas();
     near_m_ = kNearSpacings * atlas_->spacing_m();
   }

@@ -15,8 +15,9 @@ namespace farpoint {
 
 // By rays: one through each stratum of the hemisphere; what it brings back is the radiance of the
 // nearest surfel, or, near the receiver, where a surfel's size would show, that of the point itself
-// (one shadow ray per light). By cuts: the receiver's own cut from the root (§1.1), rasterized into
-// its microbuffer, whose pixels then stand for the strata.
+// (one shadow ray per light). The irradiance cache shades every point, as `pt` does. By cuts: the
+// receiver's own cut from the root (§1.1), rasterized into its microbuffer, whose pixels then stand
+// for the strata.
 class RecordGatherer final : public RecordSource {
  public:
   // All must outlive the gatherer. `settings.fill` decides the way.

@@ -12,12 +12,16 @@ namespace {
 constexpr uint32_t kDefaultMicrobuffer = 32;
 constexpr uint32_t kDefaultDegradedMicrobuffer = 16;
 
-constexpr std::array<std::string_view, 4> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt"};
+constexpr std::array<std::string_view, 5> kIntegratorNames = {"fpbgi", "pbgi", "dpbgi", "pt",
+                                                              "irrcache"};
 
 constexpr std::array<std::string_view, 4> kFilterNames = {"box", "triangle", "gaussian",
                                                           "blackman-harris"};
 constexpr std::array<std::string_view, 3> kFillNames = {"auto", "rays", "cut"};
 constexpr std::array<std::string_view, 3> kQualityNames = {"draft", "normal", "fine"};
+// Of irrcache, by quality: docs/decisions/0016-irradiance-cache.md has the figures.
+constexpr std::array<float, 3> kCacheErrors = {0.3f, 0.2f, 0.12f};
+constexpr std::array<uint32_t, 3> kCacheSamples = {512, 1024, 2048};
 constexpr std::array<float, 4> kFilterWidths = {1.0f, 2.0f, 3.0f, 3.0f};
 
 template <typename T>
@@ -36,8 +40,17 @@ uint32_t RenderSettings::microbuffer_px() const {
 }
 
 Fill RenderSettings::fill_in_force() const {
+  if (integrator == Integrator::kIrrcache) return Fill::kRays;
   if (fill != Fill::kAuto) return fill;
   return adaptive() ? Fill::kRays : Fill::kCut;
+}
+
+float RenderSettings::cache_error_in_force() const {
+  return cache_error != 0.0f ? cache_error : kCacheErrors[static_cast<size_t>(quality)];
+}
+
+uint32_t RenderSettings::cache_samples_in_force() const {
+  return cache_samples != 0 ? cache_samples : kCacheSamples[static_cast<size_t>(quality)];
 }
 
 float RenderSettings::filter_width() const {
@@ -46,7 +59,8 @@ float RenderSettings::filter_width() const {
 
 absl::Status ValidateSettings(const RenderSettings& s) {
   if (static_cast<uint32_t>(s.integrator) >= kIntegratorNames.size()) {
-    return absl::InvalidArgumentError("integrator: unknown value; use fpbgi, pbgi, dpbgi or pt");
+    return absl::InvalidArgumentError(
+        "integrator: unknown value; use fpbgi, pbgi, dpbgi, pt or irrcache");
   }
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("spp", s.spp, 1, 256));
   if (static_cast<uint32_t>(s.filter) >= kFilterNames.size()) {
@@ -85,6 +99,12 @@ absl::Status ValidateSettings(const RenderSettings& s) {
   if (static_cast<uint32_t>(s.quality) >= kQualityNames.size()) {
     return absl::InvalidArgumentError("quality: unknown value; use draft, normal or fine");
   }
+  if (s.cache_error != 0.0f && !(s.cache_error >= 0.01f && s.cache_error <= 10.0f)) {
+    return absl::InvalidArgumentError("cache-error must be 0 or between 0.01 and 10");
+  }
+  if (s.cache_samples != 0) {
+    FP_RETURN_IF_ERROR(CheckRange<uint32_t>("cache-samples", s.cache_samples, 4, 1u << 20));
+  }
   if (s.tile_px == 0 || s.tile_px % kBlockSize != 0 || s.tile_px > 65536) {
     return absl::InvalidArgumentError("tile is " + std::to_string(s.tile_px) +
                                       "; it must be a multiple of " + std::to_string(kBlockSize) +
@@ -102,8 +122,9 @@ absl::Status ValidateSettings(const RenderSettings& s) {
     if (layer == Layer::kCluster && s.integrator != Integrator::kFpbgi) {
       return absl::InvalidArgumentError("layer 'cluster' needs --integrator fpbgi");
     }
-    if (layer == Layer::kCutSize && s.integrator == Integrator::kPt) {
-      return absl::InvalidArgumentError("layer 'cutsize' needs a point-based integrator, not pt");
+    if (layer == Layer::kCutSize && !s.point_based()) {
+      return absl::InvalidArgumentError("layer 'cutsize' needs a point-based integrator, not " +
+                                        std::string(NameOf(s.integrator)));
     }
   }
   return absl::OkStatus();
@@ -125,7 +146,7 @@ absl::StatusOr<Integrator> IntegratorFromName(std::string_view name) {
     if (kIntegratorNames[i] == name) return static_cast<Integrator>(i);
   }
   return absl::InvalidArgumentError("unknown integrator '" + std::string(name) +
-                                    "'; use fpbgi, pbgi, dpbgi or pt");
+                                    "'; use fpbgi, pbgi, dpbgi, pt or irrcache");
 }
 
 std::string_view NameOf(Integrator integrator) {

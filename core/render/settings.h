@@ -16,6 +16,9 @@ enum class Integrator : uint32_t {
   kPbgi,   // point-based GI [Christensen 2008]: every receiver alone, from the root
   kDpbgi,  // pbgi with a smaller microbuffer ("degraded", paper §4)
   kPt,     // path tracing over the triangles: the ground truth
+  // The irradiance cache with gradients [WRC88, WH92], to compare with: every process that renders
+  // a tile makes the cache of the whole frame (core/irrcache/irradiance_cache.h).
+  kIrrcache,
 };
 
 // How the samples of a pixel are weighted. They are drawn from the filter's density about the
@@ -46,7 +49,9 @@ struct RenderSettings {
   Splat splat = Splat::kCoverage;
   uint32_t clusters = 0;               // fpbgi: k per block, 1..1024; 0: adaptive, see Quality
   Fill fill = Fill::kAuto;             // fpbgi: what fills a cluster's buffer
-  Quality quality = Quality::kNormal;  // fpbgi with adaptive clusters
+  Quality quality = Quality::kNormal;  // fpbgi with adaptive clusters; irrcache
+  float cache_error = 0.0f;            // irrcache: a of WRC88, 0.01..10; 0: by quality
+  uint32_t cache_samples = 0;          // irrcache: rays of a record, 4..2^20; 0: by quality
   float epsilon = 0.2f;                // far: R_cluster < epsilon (d - r); >= 0
   float normal_weight = 1.0f;          // alpha / squared block diagonal (paper §3.1)
   uint32_t kmeans_iterations = 5;      // 0..100
@@ -59,6 +64,12 @@ struct RenderSettings {
 
   // The value in force where 0 means "default".
   uint32_t microbuffer_px() const;
+  // Whether the integrator gathers from surfels and their tree; the others need none.
+  bool point_based() const {
+    return integrator != Integrator::kPt && integrator != Integrator::kIrrcache;
+  }
+  float cache_error_in_force() const;
+  uint32_t cache_samples_in_force() const;
   bool adaptive() const { return integrator == Integrator::kFpbgi && clusters == 0; }
   Fill fill_in_force() const;
   float filter_width() const;  // pixels

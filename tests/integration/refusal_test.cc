@@ -157,7 +157,7 @@ TEST_F(Refusal, OfWrongUsageIsExitCode2) {
            {"render", good},
            {"render", good, "-o", "a.exr", "--spp", "0"},
            {"render", good, "-o", "a.exr", "--fill", "x"},
-           {"render", good, "-o", "a.exr", "--integrator", "irrcache"},
+           {"render", good, "-o", "a.exr", "--integrator", "radiosity"},
            {"render", good, "-o", "a.exr", "--clusters", "adapt"},
            {"render", good, "-o", "a.exr", "--bounces", "2"},
            {"render", good, "-o", "a.exr", "--eye", "0,0,0"},

@@ -115,7 +115,7 @@ INSTANTIATE_TEST_SUITE_P(
                     Way{"fpbgi_k_cut", Integrator::kFpbgi},
                     Way{"fpbgi_k_rays", Integrator::kFpbgi, 12, Fill::kRays},
                     Way{"pbgi", Integrator::kPbgi}, Way{"dpbgi", Integrator::kDpbgi},
-                    Way{"pt", Integrator::kPt}),
+                    Way{"pt", Integrator::kPt}, Way{"irrcache", Integrator::kIrrcache}),
     [](const auto& info) { return std::string(info.param.name); });
 
 TEST(Frame, BeautyIsTheSumOfItsLayers) {

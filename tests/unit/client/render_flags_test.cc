@@ -119,6 +119,8 @@ TEST(RenderFlags, SetTheMethod) {
                                   {"--buffer-map", "cosine"},
                                   {"--splat", "opaque"},
                                   {"--clusters", "25"},
+                                  {"--cache-error", "0.125"},
+                                  {"--cache-samples", "300"},
                                   {"--epsilon", "0.25"}})
                                .settings;
   EXPECT_EQ(s.integrator, Integrator::kPbgi);
@@ -129,12 +131,14 @@ TEST(RenderFlags, SetTheMethod) {
   EXPECT_EQ(s.buffer_map, BufferMap::kCosine);
   EXPECT_EQ(s.splat, Splat::kOpaque);
   EXPECT_EQ(s.clusters, 25u);
+  EXPECT_EQ(s.cache_error, 0.125f);
+  EXPECT_EQ(s.cache_samples, 300u);
   EXPECT_EQ(s.epsilon, 0.25f);
 }
 
 TEST(RenderFlags, KnowEveryIntegrator) {
-  for (const Integrator integrator :
-       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+  for (const Integrator integrator : {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
+                                      Integrator::kPt, Integrator::kIrrcache}) {
     const std::string name(NameOf(integrator));
     EXPECT_EQ(Apply({{"--integrator", name}}).settings.integrator, integrator) << name;
   }
@@ -261,7 +265,10 @@ INSTANTIATE_TEST_SUITE_P(
     Values, RenderFlagsRefuse,
     testing::Values(
         BadValue{"--integrator", "pbgii", "did you mean 'pbgi'?"},
-        BadValue{"--integrator", "irrcache", "not built yet"},
+        BadValue{"--integrator", "irrcach", "did you mean 'irrcache'?"},
+        BadValue{"--cache-error", "0.001", "0.01"}, BadValue{"--cache-error", "x", "0.01"},
+        BadValue{"--cache-samples", "-1", "whole number"},
+        BadValue{"--cache-samples", "3", "cache-samples"},
         BadValue{"--resolution", "640", "WIDTHxHEIGHT"}, BadValue{"--resolution", "0x10", ""},
         BadValue{"--resolution", "70000x10", ""},
         BadValue{"--resolution", "10x10x10", "WIDTHxHEIGHT"},

@@ -53,6 +53,8 @@ TEST(BakeKey, IsBlindToCameraFilmAndTiles) {
   job.limits.max_pixels = 1 << 20;
   job.settings.integrator = Integrator::kPbgi;
   job.settings.spp = 4;
+  job.settings.cache_error = 0.4f;
+  job.settings.cache_samples = 333;
   job.settings.tile_px = 32;
   job.settings.layers = {Layer::kBeauty};
   job.settings.filter = PixelFilter::kBox;

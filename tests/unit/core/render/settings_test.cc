@@ -30,8 +30,8 @@ void ExpectRefused(const absl::Status& status, const std::vector<std::string>& p
 }
 
 TEST(RenderSettings, DefaultsAreValidForEveryIntegrator) {
-  for (const Integrator integrator :
-       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+  for (const Integrator integrator : {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
+                                      Integrator::kPt, Integrator::kIrrcache}) {
     const absl::Status status = Validated([&](RenderSettings& s) { s.integrator = integrator; });
     EXPECT_TRUE(status.ok()) << NameOf(integrator) << ": " << status;
   }
@@ -117,8 +117,8 @@ TEST(RenderSettings, TilesAreWholeBlocks) {
 }
 
 TEST(RenderSettings, UnknownEnumeratorsAreRefused) {
-  ExpectRefused(Validated([](RenderSettings& s) { s.integrator = static_cast<Integrator>(4); }),
-                {"integrator", "fpbgi, pbgi, dpbgi or pt"});
+  ExpectRefused(Validated([](RenderSettings& s) { s.integrator = static_cast<Integrator>(5); }),
+                {"integrator", "fpbgi, pbgi, dpbgi, pt or irrcache"});
   ExpectRefused(Validated([](RenderSettings& s) { s.buffer_map = static_cast<BufferMap>(2); }),
                 {"buffer-map", "octahedral or cosine"});
   ExpectRefused(Validated([](RenderSettings& s) { s.splat = static_cast<Splat>(2); }),
@@ -132,8 +132,8 @@ TEST(RenderSettings, UnknownEnumeratorsAreRefused) {
 // clusters, whose members share a buffer.
 TEST(RenderSettings, AClusterCannotShareACosineBuffer) {
   EXPECT_TRUE(Validated([](RenderSettings& s) { s.buffer_map = BufferMap::kCosine; }).ok());
-  for (const Integrator integrator :
-       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+  for (const Integrator integrator : {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
+                                      Integrator::kPt, Integrator::kIrrcache}) {
     const absl::Status status = Validated([&](RenderSettings& s) {
       s.integrator = integrator;
       s.clusters = 64;
@@ -154,11 +154,11 @@ TEST(RenderSettings, LayersBelongToTheirIntegrators) {
     bool good;
   };
   std::vector<Case> cases;
-  for (const Integrator i :
-       {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi, Integrator::kPt}) {
+  for (const Integrator i : {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
+                             Integrator::kPt, Integrator::kIrrcache}) {
     cases.push_back({Layer::kStdError, i, i == Integrator::kPt});
     cases.push_back({Layer::kCluster, i, i == Integrator::kFpbgi});
-    cases.push_back({Layer::kCutSize, i, i != Integrator::kPt});
+    cases.push_back({Layer::kCutSize, i, i != Integrator::kPt && i != Integrator::kIrrcache});
     cases.push_back({Layer::kIrradiance, i, true});
     cases.push_back({Layer::kDirectIrradiance, i, true});
   }
@@ -179,7 +179,8 @@ TEST(RenderSettings, NamesAndIntegratorsMatch) {
   const std::pair<const char*, Integrator> names[] = {{"fpbgi", Integrator::kFpbgi},
                                                       {"pbgi", Integrator::kPbgi},
                                                       {"dpbgi", Integrator::kDpbgi},
-                                                      {"pt", Integrator::kPt}};
+                                                      {"pt", Integrator::kPt},
+                                                      {"irrcache", Integrator::kIrrcache}};
   for (const auto& [name, integrator] : names) {
     EXPECT_EQ(NameOf(integrator), name);
     const auto parsed = IntegratorFromName(name);
@@ -188,7 +189,7 @@ TEST(RenderSettings, NamesAndIntegratorsMatch) {
   }
   for (const char* unknown : {"", "PT", "fpbgi ", "irr"}) {
     ExpectRefused(IntegratorFromName(unknown).status(),
-                  {"'" + std::string(unknown) + "'", "fpbgi, pbgi, dpbgi or pt"});
+                  {"'" + std::string(unknown) + "'", "fpbgi, pbgi, dpbgi, pt or irrcache"});
   }
 }
 
@@ -211,6 +212,38 @@ TEST(RenderSettings, ZeroMeansTheDefaultInForce) {
   EXPECT_EQ(s.fill_in_force(), Fill::kCut);
   s.fill = Fill::kRays;
   EXPECT_EQ(s.fill_in_force(), Fill::kRays);
+}
+
+TEST(RenderSettings, TheCacheFollowsTheQualityUnlessItsOwnSettingsSay) {
+  RenderSettings s;
+  s.integrator = Integrator::kIrrcache;
+  EXPECT_FALSE(s.point_based());
+  EXPECT_EQ(s.fill_in_force(), Fill::kRays);
+  s.fill = Fill::kCut;  // fpbgi's
+  EXPECT_EQ(s.fill_in_force(), Fill::kRays);
+  float error = 100;
+  uint32_t samples = 0;
+  for (const Quality quality : {Quality::kDraft, Quality::kNormal, Quality::kFine}) {
+    s.quality = quality;
+    EXPECT_LT(s.cache_error_in_force(), error);
+    EXPECT_GT(s.cache_samples_in_force(), samples);
+    error = s.cache_error_in_force();
+    samples = s.cache_samples_in_force();
+  }
+  s.cache_error = 0.07f;
+  s.cache_samples = 99;
+  EXPECT_EQ(s.cache_error_in_force(), 0.07f);
+  EXPECT_EQ(s.cache_samples_in_force(), 99u);
+  EXPECT_TRUE(ValidateSettings(s).ok());
+  for (const float bad : {-1.0f, 0.001f, 11.0f, std::numeric_limits<float>::quiet_NaN()}) {
+    s.cache_error = bad;
+    ExpectRefused(ValidateSettings(s), {"cache-error"});
+  }
+  s.cache_error = 0;
+  for (const uint32_t bad : {1u, 3u, (1u << 20) + 1}) {
+    s.cache_samples = bad;
+    ExpectRefused(ValidateSettings(s), {"cache-samples", std::to_string(bad)});
+  }
 }
 
 TEST(RenderSettings, FillsAndQualitiesHaveNames) {
