@@ -50,11 +50,16 @@ std::string RandomHex(int digits) {
 }
 
 // Progress is reported by the block: no lease may be shorter than what one may take, estimated
-// generously on one slow thread (20 µs a path, 2 ms a receiver). At most a day.
-std::chrono::milliseconds BlockTime(const RenderSettings& settings) {
+// generously on one slow thread (20 µs a path, 2 ms a receiver). irrcache's first tile makes the
+// cache of the frame, in steps of a block's share. At most a day.
+std::chrono::milliseconds BlockTime(const RenderSettings& settings, const FilmSpec& film) {
   const double receivers = 1.0 * kBlockSize * kBlockSize * settings.spp;
-  const double seconds =
+  double seconds =
       receivers * (settings.integrator == Integrator::kPt ? 2e-5 * settings.paths : 2e-3);
+  if (settings.integrator == Integrator::kIrrcache) {
+    const double blocks = std::pow(static_cast<double>(settings.tile_px) / kBlockSize, 2);
+    seconds += 2e-3 * film.width * film.height / blocks;
+  }
   return std::chrono::milliseconds(static_cast<int64_t>(1000 * std::min(seconds, 86400.0)));
 }
 
@@ -431,7 +436,8 @@ class CoordinatorImpl final : public Coordinator {
                       .film = job.stored.spec.film,
                       .settings = job.stored.spec.settings};
         work.blobs = frame.blobs;
-        work.lease_time = std::max(options_.lease_time, BlockTime(job.stored.spec.settings));
+        work.lease_time = std::max(options_.lease_time,
+                                   BlockTime(job.stored.spec.settings, job.stored.spec.film));
         return work;
       }
       const auto now = std::chrono::steady_clock::now();
@@ -824,7 +830,7 @@ class CoordinatorImpl final : public Coordinator {
     }
     if (!committed.empty()) scheduled.fingerprint = stored.fingerprint;
     scheduled.max_time = std::chrono::seconds(stored.spec.limits.max_seconds);
-    scheduled.lease_time = BlockTime(stored.spec.settings);
+    scheduled.lease_time = BlockTime(stored.spec.settings, stored.spec.film);
     scheduled.open = false;
     scheduled.paused = stored.paused;
     scheduler_.AddJob(scheduled);
