@@ -13,8 +13,7 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array<std::string_view, 5> kNotBuilt = {"paper", "scale", "stability", "skip",
-                                                       "service"};
+constexpr std::array<std::string_view, 4> kNotBuilt = {"scale", "stability", "skip", "service"};
 
 // "1280x1000". Sizes are checked by ValidateFilm.
 bool ParseResolution(std::string_view text, int& width, int& height) {
@@ -51,7 +50,8 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   if (!args.empty() &&
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
     return absl::UnimplementedError(
-        "'" + args.front() + "' is not built yet; use accuracy, pareto, rebake, lights or micro");
+        "'" + args.front() +
+        "' is not built yet; use accuracy, paper, pareto, rebake, lights or micro");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -178,6 +178,35 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
 
+  PaperOptions& w = line.paper;
+  std::string paper_resolution;
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) w.scenes_dir = scenes;
+  CLI::App* paper = app.add_subcommand(
+      "paper", "Table 1 and Figures 2, 4 and 5 of the paper; writes paper.json and paper.html");
+  AddCommonOptions(*paper, line.output_dir, w.quick);
+  paper->add_option("--scene", w.scene, "cornell, bunny, city or sponza [all that are there]");
+  paper->add_option("--scenes", w.scenes_dir,
+                    "Folder of scenes of others [FARPOINT_SCENES; without one they are left out]");
+  CLI::Option* paper_resolution_option = paper->add_option(
+      "--resolution", paper_resolution, "WxH in pixels [the paper's, quick: 96x96]");
+  paper->add_option("--points", w.points, "Surfels [the paper's, quick: 4000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  CLI::Option* blocks =
+      paper->add_option("--blocks", w.blocks, "Of 8x8 pixels, rendered by pbgi [256, quick: 8]")
+          ->check(CLI::Range(2u, 1u << 20));
+  paper->add_flag("--full", w.full, "pbgi and dpbgi of whole frames: hours")->excludes(blocks);
+  paper
+      ->add_option("--reference-budget", w.reference_budget_s,
+                   "Thread-seconds for each path-traced reference [120, quick: 2]")
+      ->check(CLI::Range(0.01, 1e6));
+  paper->add_option("--light-samples", w.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  paper->add_option("--seed", w.seed, "Of every random choice")->capture_default_str();
+  paper->add_option("--threads", w.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -187,6 +216,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                             : micro->parsed()  ? micro
                             : rebake->parsed() ? rebake
                             : lights->parsed() ? lights
+                            : paper->parsed()  ? paper
                                                : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -200,6 +230,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
               : rebake->parsed()   ? BenchVerb::kRebake
               : lights->parsed()   ? BenchVerb::kLights
               : accuracy->parsed() ? BenchVerb::kAccuracy
+              : paper->parsed()    ? BenchVerb::kPaper
                                    : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
@@ -227,6 +258,11 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   }
   if (resolution_option->count() > 0 && !ParseResolution(resolution, p.width, p.height)) {
     return absl::InvalidArgumentError("--resolution " + resolution +
+                                      " is not WIDTHxHEIGHT in pixels, such as 640x480");
+  }
+  if (paper_resolution_option->count() > 0 &&
+      !ParseResolution(paper_resolution, w.width, w.height)) {
+    return absl::InvalidArgumentError("--resolution " + paper_resolution +
                                       " is not WIDTHxHEIGHT in pixels, such as 640x480");
   }
   if (noise_option->count() > 0) p.noise = noise;

@@ -8,13 +8,14 @@
 #include "bench/accuracy.h"
 #include "bench/lights.h"
 #include "bench/micro.h"
+#include "bench/paper.h"
 #include "bench/pareto.h"
 #include "bench/rebake.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -24,6 +25,7 @@ struct BenchCommandLine {
   RebakeOptions rebake;
   LightsOptions lights;
   AccuracyOptions accuracy;
+  PaperOptions paper;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -7,6 +7,7 @@
 
 #include "bench/accuracy_report.h"
 #include "bench/command_line.h"
+#include "bench/paper_report.h"
 #include "bench/pareto_report.h"
 #include "core/base/blob.h"
 #include "core/image/png_io.h"
@@ -71,6 +72,25 @@ absl::Status Accuracy(const BenchCommandLine& line, std::ostream& out, std::ostr
   return absl::OkStatus();
 }
 
+absl::Status Paper(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "paper.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const PaperReport report, RunPaper(line.paper, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_ASSIGN_OR_RETURN(const std::string html, PaperHtml(report));
+  FP_RETURN_IF_ERROR(WriteText(dir / "paper.json", PaperJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "paper.html", html));
+  out << PaperTable(report) << "\n"
+      << (dir / "paper.json").string() << "\n"
+      << (dir / "paper.html").string() << "\n";
+  return absl::OkStatus();
+}
+
 absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
   FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
                         err << "farpoint-bench: " << text << std::endl;
@@ -115,6 +135,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Lights(line, out, err);
     case BenchVerb::kAccuracy:
       return Accuracy(line, out, err);
+    case BenchVerb::kPaper:
+      return Paper(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
