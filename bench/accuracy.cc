@@ -1,6 +1,7 @@
 #include "bench/accuracy.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdlib>
 #include <ctime>
@@ -10,6 +11,7 @@
 #include <utility>
 
 #include "absl/strings/str_format.h"
+#include "bench/accuracy_checks.h"
 #include "bench/accuracy_frame.h"
 #include "bench/accuracy_pictures.h"
 #include "bench/sparse_reference.h"
@@ -22,6 +24,8 @@ namespace farpoint {
 
 namespace {
 
+constexpr std::array<std::string_view, 6> kChecks = {
+    "seams-cornell", "seams-sponza", "leak-room", "leak-wall", "flicker-pan", "flicker-light"};
 constexpr uint64_t kPixelSeed = 20130715;
 // No seed that a user is likely to render with.
 constexpr uint64_t kReferenceSeed = 0x9e3779b97f4a7c15ull;
@@ -164,21 +168,23 @@ Truth TruthOf(const SparseReference& reference, std::span<const PixelPosition> p
   for (size_t i = 0; i < pixels.size(); ++i) {
     if (!reference.hit[i]) continue;
     truth.pixels.push_back(pixels[i]);
-    truth.indirect.push_back(reference.indirect[i]);
-    truth.direct.push_back(reference.direct[i]);
+    truth.indirect.push_back(reference.Indirect(i));
+    truth.direct.push_back(reference.Direct(i));
     truth.albedo.push_back(reference.albedo[i]);
+    // Of the sum of both lights, by their halves: their errors are independent.
+    const Rgb a = reference.indirect_half[0][i] + reference.direct_half[0][i];
+    const Rgb b = reference.indirect_half[1][i] + reference.direct_half[1][i];
     for (int c = 0; c < 3; ++c) {
       const double scale = static_cast<double>(reference.albedo[i][c] * kInvPiF);
-      const double se = scale * std::hypot(static_cast<double>(reference.indirect_error[i][c]),
-                                           static_cast<double>(reference.direct_error[i][c]));
-      variance += se * se;
-      sum += scale * static_cast<double>(reference.indirect[i][c] + reference.direct[i][c]);
+      const double error = 0.5 * scale * static_cast<double>(a[c] - b[c]);
+      variance += error * error;
+      sum += 0.5 * scale * static_cast<double>(a[c] + b[c]);
       n += 1;
     }
   }
   truth.noise = reference.IndirectNoise();
   if (sum > 0) truth.beauty_noise = std::sqrt(variance * n) / sum;
-  truth.text = absl::StrFormat("pt, %d of the pixels, %d × %d paths, noise %.4f%s",
+  truth.text = absl::StrFormat("pt, %d of the pixels, 2 × %d × %d paths, noise %.4f%s",
                                truth.pixels.size(), reference.rounds, reference.paths, truth.noise,
                                reference.from_cache ? ", kept from an earlier run" : "");
   truth.seconds = reference.seconds;
@@ -296,6 +302,25 @@ class Runner {
     return absl::OkStatus();
   }
 
+  absl::Status RunCheck(std::string_view name) {
+    progress_(Concat({name, ": started"}));
+    const AccuracyContext context{options_, executor_, bake_cache_, progress_};
+    if (name.starts_with("seams")) {
+      std::string missing;
+      FP_ASSIGN_OR_RETURN(std::optional<AccuracyCheck> check, CheckSeams(name, context, missing));
+      if (check) {
+        report_.checks.push_back(*std::move(check));
+      } else {
+        report_.left_out.push_back({std::string(name), missing});
+      }
+      return absl::OkStatus();
+    }
+    FP_ASSIGN_OR_RETURN(report_.checks.emplace_back(), name.starts_with("leak")
+                                                           ? CheckLeak(name, context)
+                                                           : CheckFlicker(name, context));
+    return absl::OkStatus();
+  }
+
  private:
   absl::StatusOr<Truth> MakeTruth(const AccuracyCase& c, const Scene& scene,
                                   const LoadedFrame& loaded, const Film& rendered) {
@@ -386,6 +411,13 @@ std::string_view NameOf(Verdict verdict) {
   return "unknown";
 }
 
+Verdict AccuracyCheck::verdict() const {
+  for (const CheckValue& v : values) {
+    if (v.bar > 0 && !(v.value <= v.bar)) return Verdict::kFails;
+  }
+  return Verdict::kHolds;
+}
+
 Verdict VerdictOf(const AccuracyCase& c, const ErrorFigures& indirect) {
   if (indirect.rr > c.rr_bar || std::fabs(indirect.bias) > c.bias_bar) return Verdict::kFails;
   return indirect.noise > c.rr_bar * kNoisePart ? Verdict::kNoisy : Verdict::kHolds;
@@ -394,6 +426,7 @@ Verdict VerdictOf(const AccuracyCase& c, const ErrorFigures& indirect) {
 std::vector<std::string> AccuracyNames(bool quick) {
   std::vector<std::string> names;
   for (const AccuracyCase& c : AccuracyCases(quick)) names.push_back(c.name);
+  for (const std::string_view check : kChecks) names.emplace_back(check);
   return names;
 }
 
@@ -409,15 +442,26 @@ absl::StatusOr<AccuracyReport> RunAccuracy(const AccuracyOptions& asked,
   FP_RETURN_IF_ERROR(ValidateSettings(MeasuredSettings(options)));
   if (options.cases.empty()) options.cases = AccuracyNames(options.quick);
   // Names first: a mistake should not cost the time of a bake.
-  std::vector<AccuracyCase> cases;
+  const std::vector<std::string> known = AccuracyNames(options.quick);
   for (const std::string& name : options.cases) {
-    FP_ASSIGN_OR_RETURN(cases.emplace_back(), FindAccuracyCase(name, options.quick));
+    if (std::find(known.begin(), known.end(), name) == known.end()) {
+      std::string names;
+      for (const std::string& k : known) Append(names, {names.empty() ? "" : ", ", k});
+      return absl::InvalidArgumentError(Concat({"--case ", name, " is none of ", names}));
+    }
   }
   report.date_utc = DateUtc();
   report.cpu = CpuModel();
   report.load_average_start = LoadAverage();
   Runner runner(options, progress, report);
-  for (const AccuracyCase& c : cases) FP_RETURN_IF_ERROR(runner.RunCase(c));
+  for (const std::string& name : options.cases) {
+    if (std::find(kChecks.begin(), kChecks.end(), name) != kChecks.end()) {
+      FP_RETURN_IF_ERROR(runner.RunCheck(name));
+      continue;
+    }
+    FP_ASSIGN_OR_RETURN(const AccuracyCase c, FindAccuracyCase(name, options.quick));
+    FP_RETURN_IF_ERROR(runner.RunCase(c));
+  }
   report.load_average_end = LoadAverage();
   return report;
 }

@@ -82,6 +82,22 @@ struct AccuracyResult {
   std::vector<AccuracyPicture> pictures;
 };
 
+// A figure that has a bar of its own, or none (0) and is for information.
+struct CheckValue {
+  std::string what;
+  double value = 0;
+  double error = 0;  // standard error; 0: none stated
+  double bar = 0;
+};
+struct AccuracyCheck {
+  std::string name, setup;
+  std::vector<CheckValue> values;
+  std::vector<AccuracyPicture> pictures;
+
+  // Fails if a value is above its bar.
+  Verdict verdict() const;
+};
+
 struct LeftOut {
   std::string name, why;
 };
@@ -92,10 +108,11 @@ struct AccuracyReport {
   unsigned threads = 0;
   double load_average_start = 0, load_average_end = 0;
   std::vector<AccuracyResult> results;
+  std::vector<AccuracyCheck> checks;
   std::vector<LeftOut> left_out;
 };
 
-// The names that --case takes, in the order in which they run.
+// The names that --case takes, in the order in which they run: cases, then checks.
 std::vector<std::string> AccuracyNames(bool quick);
 
 // Bakes each case, renders it once by fpbgi as tiles of 128 pixels, makes or reads its truth and

@@ -58,6 +58,21 @@ Row RowOf(const AccuracyResult& r) {
           std::string(NameOf(r.verdict))};
 }
 
+const Row kCheckHeader = {"check", "figure", "value", "±", "bar", "verdict"};
+
+std::vector<Row> RowsOf(const AccuracyCheck& check) {
+  std::vector<Row> rows;
+  for (const CheckValue& v : check.values) {
+    const bool barred = v.bar > 0;
+    rows.push_back(
+        {check.name, v.what, absl::StrFormat("%.5f", v.value),
+         v.error > 0 ? absl::StrFormat("%.5f", v.error) : "",
+         barred ? absl::StrFormat("%g", v.bar) : "",
+         barred ? std::string(NameOf(v.value <= v.bar ? Verdict::kHolds : Verdict::kFails)) : ""});
+  }
+  return rows;
+}
+
 // Columns of the same width; what is not ASCII counts as one.
 size_t WidthOf(std::string_view text) {
   size_t n = 0;
@@ -65,7 +80,7 @@ size_t WidthOf(std::string_view text) {
   return n;
 }
 
-std::string TextTable(const std::vector<Row>& rows) {
+std::string TextTable(const std::vector<Row>& rows, size_t left_columns) {
   std::vector<size_t> width;
   for (const Row& row : rows) {
     width.resize(std::max(width.size(), row.size()));
@@ -76,7 +91,7 @@ std::string TextTable(const std::vector<Row>& rows) {
     for (size_t i = 0; i < row.size(); ++i) {
       const std::string pad(width[i] - WidthOf(row[i]), ' ');
       if (i > 0) text += "  ";
-      text += i == 0 ? row[i] + pad : pad + row[i];
+      text += i < left_columns ? row[i] + pad : pad + row[i];
     }
     text += "\n";
   }
@@ -103,7 +118,12 @@ std::string AccuracyTable(const AccuracyReport& r) {
   std::string text = Concat({"fpbgi ", SettingsText(r.options), "\n", MachineText(r), "\n\n"});
   std::vector<Row> rows = {kHeader};
   for (const AccuracyResult& result : r.results) rows.push_back(RowOf(result));
-  if (!r.results.empty()) text += TextTable(rows);
+  if (!r.results.empty()) text += TextTable(rows, 1);
+  rows = {kCheckHeader};
+  for (const AccuracyCheck& check : r.checks) {
+    for (Row& row : RowsOf(check)) rows.push_back(std::move(row));
+  }
+  if (!r.checks.empty()) Append(text, {r.results.empty() ? "" : "\n", TextTable(rows, 2)});
   for (const LeftOut& out : r.left_out) Append(text, {"left out: ", out.name, ": ", out.why, "\n"});
   return text;
 }
@@ -131,6 +151,20 @@ std::string AccuracyJson(const AccuracyReport& r) {
                      {"truth_seconds", result.truth_seconds},
                      {"verdict", NameOf(result.verdict)}});
   }
+  Json checks = Json::array();
+  for (const AccuracyCheck& check : r.checks) {
+    Json values = Json::array();
+    for (const CheckValue& v : check.values) {
+      values.push_back({{"what", v.what},
+                        {"value", v.value},
+                        {"error", v.error > 0 ? Json(v.error) : Json()},
+                        {"bar", v.bar > 0 ? Json(v.bar) : Json()}});
+    }
+    checks.push_back({{"name", check.name},
+                      {"setup", check.setup},
+                      {"values", values},
+                      {"verdict", NameOf(check.verdict())}});
+  }
   Json left_out = Json::array();
   for (const LeftOut& out : r.left_out) left_out.push_back({{"name", out.name}, {"why", out.why}});
   const Json json = {
@@ -151,6 +185,7 @@ std::string AccuracyJson(const AccuracyReport& r) {
         {"light_samples", r.options.light_samples},
         {"seed", r.options.seed}}},
       {"cases", cases},
+      {"checks", checks},
       {"left_out", left_out},
   };
   return json.dump(2) + "\n";
@@ -172,6 +207,11 @@ absl::StatusOr<std::string> AccuracyHtml(const AccuracyReport& r) {
   HtmlTable table{kHeader, {}, 2};
   for (const AccuracyResult& result : r.results) table.rows.push_back(RowOf(result));
   if (!table.rows.empty()) page.Table(table);
+  HtmlTable checks{kCheckHeader, {}, 2};
+  for (const AccuracyCheck& check : r.checks) {
+    for (Row& row : RowsOf(check)) checks.rows.push_back(std::move(row));
+  }
+  if (!checks.rows.empty()) page.Table(checks);
   if (!r.left_out.empty()) {
     std::vector<HtmlFact> left_out;
     for (const LeftOut& out : r.left_out) left_out.push_back({"Left out: " + out.name, out.why});
@@ -187,6 +227,11 @@ absl::StatusOr<std::string> AccuracyHtml(const AccuracyReport& r) {
                          result.surfels, result.records, result.receivers)}};
     page.Facts(facts);
     FP_RETURN_IF_ERROR(AddFigures(result.pictures, page));
+  }
+  for (const AccuracyCheck& check : r.checks) {
+    page.Heading(check.name);
+    page.Paragraph(check.setup);
+    FP_RETURN_IF_ERROR(AddFigures(check.pictures, page));
   }
   return std::move(page).Finish();
 }

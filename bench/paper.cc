@@ -561,7 +561,7 @@ class SceneRun {
                         TraceSparseReference(frame_, pixels, options, executor_, progress_));
     std::vector<Rgb> expected;
     for (size_t i = 0; i < pixels.size(); ++i) {
-      if (truth.hit[i] != 0) expected.push_back(truth.indirect[i]);
+      if (truth.hit[i] != 0) expected.push_back(truth.Indirect(i));
     }
     report_.reference_pixels = expected.size();
     report_.reference_paths = uint64_t{truth.paths} * truth.rounds;

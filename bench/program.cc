@@ -58,11 +58,17 @@ absl::Status Accuracy(const BenchCommandLine& line, std::ostream& out, std::ostr
                         err << "farpoint-bench: " << text << std::endl;
                       }));
   FP_ASSIGN_OR_RETURN(const std::string html, AccuracyHtml(report));
-  for (const AccuracyResult& result : report.results) {
-    for (const AccuracyPicture& picture : result.pictures) {
-      FP_RETURN_IF_ERROR(
-          WritePng((dir / picture.file).string(), picture.width, picture.height, picture.rgb));
+  const auto write_pictures = [&](const std::vector<AccuracyPicture>& pictures) -> absl::Status {
+    for (const AccuracyPicture& p : pictures) {
+      FP_RETURN_IF_ERROR(WritePng((dir / p.file).string(), p.width, p.height, p.rgb));
     }
+    return absl::OkStatus();
+  };
+  for (const AccuracyResult& result : report.results) {
+    FP_RETURN_IF_ERROR(write_pictures(result.pictures));
+  }
+  for (const AccuracyCheck& check : report.checks) {
+    FP_RETURN_IF_ERROR(write_pictures(check.pictures));
   }
   FP_RETURN_IF_ERROR(WriteText(dir / "accuracy.json", AccuracyJson(report)));
   FP_RETURN_IF_ERROR(WriteText(dir / "accuracy.html", html));

@@ -16,7 +16,7 @@ namespace farpoint {
 
 namespace {
 
-constexpr uint64_t kMagic = 0x3146455245535046ull;  // "FPSEREF1"
+constexpr uint64_t kMagic = 0x3246455245535046ull;  // "FPSEREF2"
 // Raised whenever what pt estimates, or its standard error, changes.
 constexpr uint32_t kEstimateVersion = 1;
 constexpr uint32_t kMaxPaths = 1u << 20;
@@ -51,21 +51,24 @@ Rgb GetRgb(const Film& film, Layer layer, int x, int y) {
   return {film.Get(layer, 0, x, y), film.Get(layer, 1, x, y), film.Get(layer, 2, x, y)};
 }
 
-Rgb Sqrt(const Rgb& v) { return {std::sqrt(v.x), std::sqrt(v.y), std::sqrt(v.z)}; }
+Rgb HalfDifference(const Rgb& a, const Rgb& b) {
+  const Rgb d = (a - b) * 0.5f;
+  return {std::fabs(d.x), std::fabs(d.y), std::fabs(d.z)};
+}
 
-double Noise(const std::vector<uint8_t>& hit, const std::vector<Rgb>& value,
-             const std::vector<Rgb>& error) {
-  double sum = 0, variance = 0, n = 0;
-  for (size_t i = 0; i < value.size(); ++i) {
+double Noise(const std::vector<uint8_t>& hit, const std::array<std::vector<Rgb>, 2>& half) {
+  double sum = 0, square = 0, n = 0;
+  for (size_t i = 0; i < half[0].size(); ++i) {
     if (!hit[i]) continue;
     for (int c = 0; c < 3; ++c) {
-      const double se = static_cast<double>(error[i][c]);
-      sum += static_cast<double>(value[i][c]);
-      variance += se * se;
+      const double a = static_cast<double>(half[0][i][c]);
+      const double b = static_cast<double>(half[1][i][c]);
+      sum += 0.5 * (a + b);
+      square += 0.25 * (a - b) * (a - b);
       n += 1;
     }
   }
-  return sum > 0 ? std::sqrt(variance * n) / sum : 0.0;
+  return sum > 0 ? std::sqrt(square * n) / sum : 0.0;
 }
 
 // Renders pixels by pt, each as a tile.
@@ -117,35 +120,35 @@ RenderSettings IndirectSettings(uint32_t paths, uint64_t seed) {
   RenderSettings settings;
   settings.paths = paths;
   settings.seed = seed;
-  settings.layers = {Layer::kIrradiance, Layer::kStdError, Layer::kDepth, Layer::kAlbedo};
+  settings.layers = {Layer::kIrradiance, Layer::kDepth, Layer::kAlbedo};
   return settings;
 }
 
-void Store(const PixelTracer::Pass& pass, std::span<const PixelPosition> pixels,
+// One half of a round. Receivers are the same for both.
+void Store(const PixelTracer::Pass& pass, std::span<const PixelPosition> pixels, int half,
            SparseReference& out) {
   const size_t n = pixels.size();
   out.hit.assign(n, 0);
-  out.indirect.assign(n, Rgb());
-  out.indirect_error.assign(n, Rgb());
   out.albedo.assign(n, Rgb());
+  std::vector<Rgb>& values = out.indirect_half[static_cast<size_t>(half)];
+  values.assign(n, Rgb());
   for (size_t i = 0; i < n; ++i) {
     const int x = pixels[i].x, y = pixels[i].y;
     const Film& film = pass.films[i];
     out.hit[i] = std::isfinite(film.Get(Layer::kDepth, 0, x, y));
-    out.indirect[i] = GetRgb(film, Layer::kIrradiance, x, y);
-    out.indirect_error[i] = GetRgb(film, Layer::kStdError, x, y);
     out.albedo[i] = GetRgb(film, Layer::kAlbedo, x, y);
+    values[i] = GetRgb(film, Layer::kIrradiance, x, y);
   }
 }
 
-// Adds an independent round of as many paths to the mean.
+// Adds an independent round of as many paths to the means.
 void Average(const SparseReference& round, SparseReference& mean) {
   const float n = static_cast<float>(mean.rounds);
-  const float whole = n + 1.0f;
-  for (size_t i = 0; i < mean.hit.size(); ++i) {
-    mean.indirect[i] = (mean.indirect[i] * n + round.indirect[i]) / whole;
-    const Rgb a = mean.indirect_error[i] * n, b = round.indirect_error[i];
-    mean.indirect_error[i] = Sqrt(a * a + b * b) / whole;
+  for (size_t h = 0; h < 2; ++h) {
+    for (size_t i = 0; i < mean.hit.size(); ++i) {
+      mean.indirect_half[h][i] =
+          (mean.indirect_half[h][i] * n + round.indirect_half[h][i]) / (n + 1.0f);
+    }
   }
 }
 
@@ -156,26 +159,23 @@ std::vector<PixelPosition> Thinned(std::span<const PixelPosition> pixels, size_t
   return few;
 }
 
-struct Plan {
-  uint32_t paths = 0;
-  double seconds_per_path = 0;  // of one pixel
-};
-
-absl::StatusOr<Plan> Pilot(const PixelTracer& tracer, std::span<const PixelPosition> pixels,
-                           const SparseReferenceOptions& options) {
+// Paths for each half.
+absl::StatusOr<uint32_t> Pilot(const PixelTracer& tracer, std::span<const PixelPosition> pixels,
+                               const SparseReferenceOptions& options) {
   const std::vector<PixelPosition> few = Thinned(pixels, kPilotPixels);
   double noise[2], seconds[2];
   for (int i = 0; i < 2; ++i) {
-    FP_ASSIGN_OR_RETURN(
-        const PixelTracer::Pass pass,
-        tracer.Render(few,
-                      IndirectSettings(kPilotPaths[i],
-                                       HashKey(options.seed, kKeyPilot, static_cast<uint64_t>(i))),
-                      [](double) {}));
     SparseReference pilot;
-    Store(pass, few, pilot);
+    seconds[i] = 0;
+    for (int half = 0; half < 2; ++half) {
+      const uint64_t seed = HashKey(options.seed, kKeyPilot, static_cast<uint64_t>(2 * i + half));
+      FP_ASSIGN_OR_RETURN(
+          const PixelTracer::Pass pass,
+          tracer.Render(few, IndirectSettings(kPilotPaths[i], seed), [](double) {}));
+      Store(pass, few, half, pilot);
+      seconds[i] += pass.seconds;
+    }
     noise[i] = pilot.IndirectNoise();
-    seconds[i] = pass.seconds;
   }
   // Between random and quasi-random convergence.
   double slope = 0.5;
@@ -187,28 +187,24 @@ absl::StatusOr<Plan> Pilot(const PixelTracer& tracer, std::span<const PixelPosit
   const double needed = noise[1] > options.noise
                             ? kPilotPaths[1] * std::pow(noise[1] / options.noise, 1.0 / slope)
                             : static_cast<double>(options.min_paths);
-  Plan plan;
-  // The primary rays of a block are the same for both.
-  plan.seconds_per_path = std::max(0.0, seconds[1] - seconds[0]) /
-                          (static_cast<double>(few.size()) * (kPilotPaths[1] - kPilotPaths[0]));
+  // Of a path for each half. The primary rays of a block are the same for all numbers of paths.
+  const double seconds_per_path =
+      std::max(0.0, seconds[1] - seconds[0]) /
+      (static_cast<double>(few.size()) * (kPilotPaths[1] - kPilotPaths[0]));
   const double affordable =
-      plan.seconds_per_path > 0
-          ? options.budget_s / (plan.seconds_per_path * static_cast<double>(pixels.size()))
+      seconds_per_path > 0
+          ? options.budget_s / (seconds_per_path * static_cast<double>(pixels.size()))
           : static_cast<double>(kMaxPaths);
   const double most = std::min(affordable, static_cast<double>(kMaxPaths));
   // A power of two keeps Sobol' points balanced: the next above what is needed, unless the budget
   // ends below it.
   uint32_t paths = std::bit_ceil(std::max(8u, options.min_paths));
-  while (paths < kMaxPaths && paths < needed && 2.0 * paths <= most) paths *= 2;
-  plan.paths = paths;
-  return plan;
+  while (paths < needed && 2.0 * paths <= most) paths *= 2;
+  return paths;
 }
 
 absl::Status TraceDirect(const PixelTracer& tracer, std::span<const PixelPosition> pixels,
                          const SparseReferenceOptions& options, SparseReference& out) {
-  out.direct.assign(pixels.size(), Rgb());
-  out.direct_error.assign(pixels.size(), Rgb());
-  std::vector<Rgb> half[2];
   for (int i = 0; i < 2; ++i) {
     RenderSettings settings;
     settings.paths = 1;
@@ -218,13 +214,9 @@ absl::Status TraceDirect(const PixelTracer& tracer, std::span<const PixelPositio
     FP_ASSIGN_OR_RETURN(const PixelTracer::Pass pass,
                         tracer.Render(pixels, settings, [](double) {}));
     for (size_t p = 0; p < pixels.size(); ++p) {
-      half[i].push_back(GetRgb(pass.films[p], Layer::kDirectIrradiance, pixels[p].x, pixels[p].y));
+      out.direct_half[static_cast<size_t>(i)].push_back(
+          GetRgb(pass.films[p], Layer::kDirectIrradiance, pixels[p].x, pixels[p].y));
     }
-  }
-  for (size_t p = 0; p < pixels.size(); ++p) {
-    out.direct[p] = (half[0][p] + half[1][p]) * 0.5f;
-    const Rgb d = (half[0][p] - half[1][p]) * 0.5f;
-    out.direct_error[p] = Rgb(std::fabs(d.x), std::fabs(d.y), std::fabs(d.z));
   }
   return absl::OkStatus();
 }
@@ -255,8 +247,14 @@ std::vector<PixelPosition> StratifiedPixels(const PixelRect& rect, size_t count,
   return pixels;
 }
 
-double SparseReference::IndirectNoise() const { return Noise(hit, indirect, indirect_error); }
-double SparseReference::DirectNoise() const { return Noise(hit, direct, direct_error); }
+Rgb SparseReference::IndirectError(size_t i) const {
+  return HalfDifference(indirect_half[0][i], indirect_half[1][i]);
+}
+Rgb SparseReference::DirectError(size_t i) const {
+  return HalfDifference(direct_half[0][i], direct_half[1][i]);
+}
+double SparseReference::IndirectNoise() const { return Noise(hit, indirect_half); }
+double SparseReference::DirectNoise() const { return Noise(hit, direct_half); }
 
 std::vector<std::byte> EncodeSparseReference(const SparseReference& r, const Digest& key) {
   ByteWriter out;
@@ -265,15 +263,15 @@ std::vector<std::byte> EncodeSparseReference(const SparseReference& r, const Dig
   out.Put<uint32_t>(r.paths);
   out.Put<uint32_t>(r.rounds);
   out.Put<double>(r.seconds);
-  const bool direct = !r.direct.empty();
+  const bool direct = !r.direct_half[0].empty();
   out.Put<uint32_t>(direct ? 1 : 0);
   out.PutArray(std::span<const uint8_t>(r.hit));
-  for (const std::vector<Rgb>* values : {&r.indirect, &r.indirect_error, &r.albedo}) {
+  for (const std::vector<Rgb>* values : {&r.indirect_half[0], &r.indirect_half[1], &r.albedo}) {
     out.PutArray(std::span<const Rgb>(*values));
   }
   if (direct) {
-    out.PutArray(std::span<const Rgb>(r.direct));
-    out.PutArray(std::span<const Rgb>(r.direct_error));
+    out.PutArray(std::span<const Rgb>(r.direct_half[0]));
+    out.PutArray(std::span<const Rgb>(r.direct_half[1]));
   }
   std::vector<std::byte> bytes = out.Take();
   const Digest checksum = HashBytes(bytes);
@@ -321,12 +319,12 @@ absl::StatusOr<SparseReference> DecodeSparseReference(std::span<const std::byte>
     values.assign(view.begin(), view.end());
     return absl::OkStatus();
   };
-  FP_RETURN_IF_ERROR(rgb(r.indirect, "indirect"));
-  FP_RETURN_IF_ERROR(rgb(r.indirect_error, "indirect_error"));
+  FP_RETURN_IF_ERROR(rgb(r.indirect_half[0], "indirect A"));
+  FP_RETURN_IF_ERROR(rgb(r.indirect_half[1], "indirect B"));
   FP_RETURN_IF_ERROR(rgb(r.albedo, "albedo"));
   if (direct == 1) {
-    FP_RETURN_IF_ERROR(rgb(r.direct, "direct"));
-    FP_RETURN_IF_ERROR(rgb(r.direct_error, "direct_error"));
+    FP_RETURN_IF_ERROR(rgb(r.direct_half[0], "direct A"));
+    FP_RETURN_IF_ERROR(rgb(r.direct_half[1], "direct B"));
   }
   FP_RETURN_IF_ERROR(in.ExpectEnd());
   return r;
@@ -368,19 +366,21 @@ absl::StatusOr<SparseReference> TraceSparseReference(
   SparseReference reference;
   const auto trace_round = [&](uint32_t paths, uint32_t round, SparseReference& out,
                                double& seconds) -> absl::Status {
-    double said = 0;
-    const auto part = [&](double done) {
-      if (done < said + 0.25) return;
-      said = done;
-      progress(absl::StrFormat("%s: %d pixels, %d paths, round %d: %.0f %%", options.label,
-                               pixels.size(), paths, round + 1, 100 * done));
-    };
-    FP_ASSIGN_OR_RETURN(
-        const PixelTracer::Pass pass,
-        tracer.Render(pixels, IndirectSettings(paths, HashKey(options.seed, kKeyRound, round)),
-                      part));
-    Store(pass, pixels, out);
-    seconds = pass.seconds;
+    seconds = 0;
+    for (int half = 0; half < 2; ++half) {
+      double said = 0;
+      const auto part = [&](double done) {
+        if (done < said + 0.5) return;
+        said = done;
+        progress(absl::StrFormat("%s: %d pixels, 2 x %d paths, round %d: %.0f %%", options.label,
+                                 pixels.size(), paths, round + 1, 50 * (half + done)));
+      };
+      const uint64_t seed = HashKey(options.seed, kKeyRound, round, static_cast<uint64_t>(half));
+      FP_ASSIGN_OR_RETURN(const PixelTracer::Pass pass,
+                          tracer.Render(pixels, IndirectSettings(paths, seed), part));
+      Store(pass, pixels, half, out);
+      seconds += pass.seconds;
+    }
     return absl::OkStatus();
   };
   double spent = 0, last = 0;
@@ -390,9 +390,9 @@ absl::StatusOr<SparseReference> TraceSparseReference(
     reference.from_cache = true;
     last = reference.seconds / reference.rounds;
   } else {
-    FP_ASSIGN_OR_RETURN(const Plan plan, Pilot(tracer, pixels, options));
-    FP_RETURN_IF_ERROR(trace_round(plan.paths, 0, reference, last));
-    reference.paths = plan.paths;
+    FP_ASSIGN_OR_RETURN(const uint32_t paths, Pilot(tracer, pixels, options));
+    FP_RETURN_IF_ERROR(trace_round(paths, 0, reference, last));
+    reference.paths = paths;
     reference.rounds = 1;
     reference.seconds = spent = last;
     if (options.direct_samples > 0) {

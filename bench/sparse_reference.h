@@ -2,6 +2,8 @@
 // too dear; a few thousand pixels, one in each cell of a grid, tell an error as well.
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
 #include <functional>
 #include <memory>
@@ -36,11 +38,12 @@ struct SparseFrame {
 };
 
 struct SparseReferenceOptions {
-  double noise = 0.01;             // aim: root mean square standard error over mean
-  double budget_s = 200;           // thread-seconds that a call may trace for indirect light, about
-  uint32_t min_paths = 64;         // per pixel and round; 8..2^20
-  uint32_t direct_samples = 1024;  // as RenderSettings::light_samples, twice; 0: no direct light
-  uint64_t seed = 0;               // of the paths; no seed of a render to be measured
+  double noise = 0.01;      // aim: root mean square error over mean
+  double budget_s = 200;    // thread-seconds that a call may trace for indirect light, about
+  uint32_t min_paths = 64;  // per pixel, half and round; 8..2^20
+  uint32_t direct_samples =
+      1024;           // as RenderSettings::light_samples, of a half; 0: no direct light
+  uint64_t seed = 0;  // of the paths; no seed of a render to be measured
   // Where references are kept; empty: nowhere. A file is named by `label` and its key and is
   // replaced as a whole.
   std::string cache_dir;
@@ -50,27 +53,31 @@ struct SparseReferenceOptions {
 // By pixel, in the order in which pixels were asked for. 0 where the primary ray hits nothing.
 struct SparseReference {
   std::vector<uint8_t> hit;
-  std::vector<Rgb> indirect;        // irradiance, W/m²
-  std::vector<Rgb> indirect_error;  // its standard error
-  std::vector<Rgb> direct;          // irradiance, W/m²; empty if it was not asked for
-  std::vector<Rgb> direct_error;
+  // Irradiance, W/m²: two independent estimates of each. direct is empty if it was not asked for.
+  std::array<std::vector<Rgb>, 2> indirect_half, direct_half;
   std::vector<Rgb> albedo;
-  uint32_t paths = 0;       // per pixel and round
-  uint32_t rounds = 0;      // independent renders of so many paths; the mean counts
+  uint32_t paths = 0;       // per pixel, half and round
+  uint32_t rounds = 0;      // independent renders of so many paths for each half; their means count
   double seconds = 0;       // thread-seconds that all rounds took
   bool from_cache = false;  // nothing was traced
 
-  // Root mean square of the standard errors over the mean, of pixels that hit; 0 if the mean is 0.
+  // The mean of the halves.
+  Rgb Indirect(size_t i) const { return (indirect_half[0][i] + indirect_half[1][i]) * 0.5f; }
+  Rgb Direct(size_t i) const { return (direct_half[0][i] + direct_half[1][i]) * 0.5f; }
+  // |A - B| / 2: its mean square is that of the mean's error, whatever the distribution. So
+  // (x - mean)² - error² = (x - A)(x - B) has no bias as the square of x's error.
+  Rgb IndirectError(size_t i) const;
+  Rgb DirectError(size_t i) const;
+
+  // Root mean square of the errors over the mean, of pixels that hit; 0 if the mean is 0.
   double IndirectNoise() const;
   double DirectNoise() const;
 };
 
 // Renders `pixels` by `pt` as tiles of one pixel, so that camera, film and receivers are those of
-// every other integrator. A pilot of 64 and of 256 paths at up to 256 of the pixels says how many
-// paths the aim takes; rounds are added until it is reached or the budget would be passed, but
-// always one. What the cache holds counts: a call with a lower aim or another budget goes on from
-// there. Standard errors are those of Layer::kStdError, which errs on the high side; the direct
-// ones come from two independent halves.
+// every other integrator. A pilot at up to 256 of the pixels says how many paths the aim takes;
+// rounds are added until it is reached or the budget would be passed, but always one. What the
+// cache holds counts: a call with a lower aim or another budget goes on from there.
 //
 // The cache's key is the hash of the scene, camera, film, pixels, direct samples, seed and of a
 // version that changes when pt's estimate does. kDataLoss names a damaged file of the cache;
