@@ -199,6 +199,12 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->add_option("--reference-budget", w.reference_budget_s,
                    "Thread-seconds for each path-traced reference [120, quick: 2]")
       ->check(CLI::Range(0.01, 1e6));
+  std::string splat;
+  CLI::Option* splat_option =
+      paper->add_option("--splat", splat, "opaque or coverage, in place of the paper's [opaque]")
+          ->check(CLI::IsMember({"opaque", "coverage"}));
+  paper->add_option("--microbuffer", w.microbuffer, "Side of pbgi's and fpbgi's buffers [24]")
+      ->check(CLI::Range(1, 256));
   paper->add_option("--light-samples", w.light_samples, "Shadow rays, as of farpoint render")
       ->capture_default_str()
       ->check(CLI::Range(1, 4096));
@@ -259,6 +265,9 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   if (resolution_option->count() > 0 && !ParseResolution(resolution, p.width, p.height)) {
     return absl::InvalidArgumentError("--resolution " + resolution +
                                       " is not WIDTHxHEIGHT in pixels, such as 640x480");
+  }
+  if (splat_option->count() > 0) {
+    w.splat = splat == "coverage" ? Splat::kCoverage : Splat::kOpaque;
   }
   if (paper_resolution_option->count() > 0 &&
       !ParseResolution(paper_resolution, w.width, w.height)) {

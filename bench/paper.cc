@@ -248,10 +248,22 @@ class SceneRun {
  private:
   void Say(std::string_view text) const { progress_(Concat({report_.scene.name, ": ", text})); }
 
-  // The paper's parameters.
+  // Says how far a render of the whole frame is, three times.
+  std::function<void(int, int)> Quarters() const {
+    return [this](int done, int total) {
+      const int quarter = 4 * done / total;
+      if (quarter > 0 && quarter < 4 && 4 * (done - 1) / total < quarter) {
+        Say(absl::StrFormat("%d %%", 25 * quarter));
+      }
+    };
+  }
+
+  // The paper's parameters, unless others were asked for.
   RenderSettings Settings(Integrator integrator, std::vector<Layer> layers) const {
     RenderSettings s;
     ApplyPaperPreset(s);
+    if (options_.splat) s.splat = *options_.splat;
+    if (options_.microbuffer > 0) s.microbuffer = options_.microbuffer;
     s.integrator = integrator;
     s.points = options_.points > 0 ? options_.points : report_.scene.points;
     s.light_samples = options_.light_samples;
@@ -289,7 +301,8 @@ class SceneRun {
     const RenderSettings settings = Settings(
         Integrator::kFpbgi, {Layer::kBeauty, Layer::kIndirect, Layer::kIrradiance, Layer::kDepth});
     FP_ASSIGN_OR_RETURN(const auto renderer, Renderer(settings));
-    FP_ASSIGN_OR_RETURN(TileOutput out, renderer->RenderTile(frame_rect_, executor_, {}, nullptr));
+    FP_ASSIGN_OR_RETURN(TileOutput out,
+                        renderer->RenderTile(frame_rect_, executor_, Quarters(), nullptr));
     report_.receivers = out.stats.counts["receivers"];
     report_.primary_s = SecondsOf(out.stats, Stage::kPrimary);
     report_.direct_s = SecondsOf(out.stats, Stage::kDirect);
@@ -318,7 +331,7 @@ class SceneRun {
     BlockRender render;
     if (options_.full) {
       FP_ASSIGN_OR_RETURN(TileOutput out,
-                          renderer->RenderTile(frame_rect_, executor_, {}, nullptr));
+                          renderer->RenderTile(frame_rect_, executor_, Quarters(), nullptr));
       render.times = TimesOf(out.stats);
       render.film = std::move(out.film);
       return render;

@@ -34,7 +34,10 @@ struct PaperOptions {
   uint64_t points = 0;            // surfels: the paper's, 4,000
   unsigned blocks = 0;            // of 8x8 pixels on which pbgi runs: 256, 8
   double reference_budget_s = 0;  // thread-seconds of each path-traced reference: 120, 2
-  uint32_t light_samples = 32;    // as RenderSettings
+  // In place of the preset's: what would change if the paper had chosen otherwise.
+  std::optional<Splat> splat;
+  uint32_t microbuffer = 0;     // side of pbgi's and fpbgi's buffers: 24
+  uint32_t light_samples = 32;  // as RenderSettings
   uint64_t seed = 0;
   unsigned threads = 0;  // all cores
   bool full = false;     // pbgi and dpbgi of the whole frame

@@ -84,6 +84,25 @@ std::string TruthText(const PaperSceneReport& s) {
       s.reference_paths, s.reference_pixels, s.fpbgi.truth.noise, s.reference_seconds);
 }
 
+Splat SplatInForce(const PaperReport& r) {
+  RenderSettings paper;
+  ApplyPaperPreset(paper);
+  return r.options.splat.value_or(paper.splat);
+}
+std::string NameOfSplat(const PaperReport& r) {
+  return SplatInForce(r) == Splat::kOpaque ? "opaque" : "coverage";
+}
+// What is not the paper's; empty if all is.
+std::string OtherThanPaper(const PaperReport& r) {
+  std::string text;
+  if (r.options.splat) text = Concat({"splats are ", NameOfSplat(r)});
+  if (r.options.microbuffer > 0) {
+    Append(text, {text.empty() ? "" : ", ",
+                  absl::StrFormat("buffers have %d² pixels", r.options.microbuffer)});
+  }
+  return text;
+}
+
 // How near dpbgi's time is to fpbgi's.
 std::string MatchText(const PaperSceneReport& s) {
   return absl::StrFormat("%.3f", Ratio(s.dpbgi.times.gather, s.fpbgi.times.gather));
@@ -424,6 +443,9 @@ absl::StatusOr<std::string> PaperHtml(const PaperReport& r) {
       {"Run",
        absl::StrFormat("farpoint %s, %s%s", FARPOINT_VERSION, r.date_utc,
                        r.options.quick ? ", quick: a check that all works, no measurement" : "")}};
+  if (const std::string other = OtherThanPaper(r); !other.empty()) {
+    facts.push_back({"Not as in --preset paper", other});
+  }
   for (const LeftOut& l : r.left_out) facts.push_back({"Left out: " + l.name, l.why});
   page.Facts(facts);
   page.Paragraph(
@@ -462,7 +484,11 @@ absl::StatusOr<std::string> PaperHtml(const PaperReport& r) {
 }
 
 std::string PaperTable(const PaperReport& r) {
-  std::string table = Concat({"machine    ", MachineText(r), "\n\n"});
+  std::string table = Concat({"machine    ", MachineText(r), "\n"});
+  if (const std::string other = OtherThanPaper(r); !other.empty()) {
+    Append(table, {"not as in --preset paper: ", other, "\n"});
+  }
+  table += "\n";
   absl::StrAppendFormat(&table, "%-8s%-9s%9s%9s%10s%10s%7s%10s%10s%7s%10s%10s%7s%9s%10s\n", "scene",
                         "", "points", "cluster", "cut p", "cut f", "x", "raster p", "raster f", "x",
                         "full p", "full f", "x", "PDP/M", "MSE");

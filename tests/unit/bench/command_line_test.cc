@@ -53,10 +53,11 @@ TEST(BenchCommandLine, ParetoNeedsNothing) {
 
 TEST(BenchCommandLine, PaperTakesAll) {
   const auto line = ParseBenchCommandLine(
-      {"paper",   "--scene",         "city", "--scenes", "s",  "--resolution",
-       "320x200", "--points",        "1234", "--blocks", "12", "--reference-budget",
-       "0.5",     "--light-samples", "8",    "--seed",   "9",  "--threads",
-       "1",       "--quick",         "-o",   "there"});
+      {"paper",    "--scene",       "city", "--scenes",           "s",   "--resolution",
+       "320x200",  "--points",      "1234", "--blocks",           "12",  "--splat",
+       "coverage", "--microbuffer", "32",   "--reference-budget", "0.5", "--light-samples",
+       "8",        "--seed",        "9",    "--threads",          "1",   "--quick",
+       "-o",       "there"});
   ASSERT_TRUE(line.ok()) << line.status();
   EXPECT_EQ(line->verb, BenchVerb::kPaper);
   EXPECT_EQ(line->output_dir, "there");
@@ -68,6 +69,8 @@ TEST(BenchCommandLine, PaperTakesAll) {
   EXPECT_EQ(p.points, 1234u);
   EXPECT_EQ(p.blocks, 12u);
   EXPECT_EQ(p.reference_budget_s, 0.5);
+  EXPECT_EQ(p.splat, Splat::kCoverage);
+  EXPECT_EQ(p.microbuffer, 32u);
   EXPECT_EQ(p.light_samples, 8u);
   EXPECT_EQ(p.seed, 9u);
   EXPECT_EQ(p.threads, 1u);
@@ -82,6 +85,7 @@ TEST(BenchCommandLine, PaperRefusesWhatDoesNotFit) {
   EXPECT_THAT(MessageOf({"paper", "--full", "--blocks", "9"}), HasSubstr("--full"));
   EXPECT_THAT(MessageOf({"paper", "--resolution", "wide"}), HasSubstr("wide"));
   EXPECT_NE(MessageOf({"paper", "--blocks", "1"}), "");
+  EXPECT_THAT(MessageOf({"paper", "--splat", "round"}), HasSubstr("round"));
 }
 
 TEST(BenchCommandLine, MicroTakesAll) {

@@ -268,6 +268,20 @@ TEST(Paper, SampleTellsOfTheWholeFrame) {
   EXPECT_EQ(part.fpbgi.truth.rel_rmse, full.fpbgi.truth.rel_rmse);
 }
 
+TEST(Paper, OtherParametersAreInForce) {
+  ASSERT_TRUE(TinyPaper().ok()) << TinyPaper().status();
+  PaperOptions options = TinyPaperOptions();
+  options.splat = Splat::kCoverage;
+  options.microbuffer = 16;
+  const auto other = RunPaper(options, [](std::string_view) {});
+  ASSERT_TRUE(other.ok()) << other.status();
+  EXPECT_EQ(other->scenes[0].pbgi.microbuffer, 16u);
+  EXPECT_EQ(other->scenes[0].fpbgi.microbuffer, 16u);
+  EXPECT_LE(other->scenes[0].dpbgi.microbuffer, 16u);
+  // Coverage is the better splat even in smaller buffers.
+  EXPECT_LT(other->scenes[0].pbgi.truth.rr, TinyPaper()->scenes[0].pbgi.truth.rr);
+}
+
 TEST(Paper, ScenesThatAreMissingAreLeftOutOrRefused) {
   PaperOptions options = TinyPaperOptions();
   options.scene = "sponza";
