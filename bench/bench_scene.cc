@@ -13,9 +13,7 @@ namespace {
 constexpr unsigned kCityBlocks = 4, kSmallCityBlocks = 2;
 constexpr uint64_t kCitySeed = 1;
 
-}  // namespace
-
-absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small) {
+absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small, bool light_chosen) {
   if (name_or_path == "cornell") return BenchScene{MakeCornellBox(), {}};
   if (name_or_path == "furnace") return BenchScene{MakeFurnace(0.5f, 1.0f), {}};
   if (name_or_path == "city") {
@@ -23,8 +21,31 @@ absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool 
   }
   FP_ASSIGN_OR_RETURN(const AssetBundle asset, CollectAsset(name_or_path));
   FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, ImportOptions()));
-  EnsureCameraAndLight(imported, /*light_chosen=*/false);
+  EnsureCameraAndLight(imported, light_chosen);
   return BenchScene{std::move(imported.scene), std::move(imported.notes)};
+}
+
+}  // namespace
+
+absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small,
+                                          const SceneChanges& changes) {
+  FP_ASSIGN_OR_RETURN(BenchScene made, Load(name_or_path, small,
+                                            changes.sun.has_value() || changes.sky.has_value()));
+  Scene& scene = made.scene;
+  if (changes.sun) {
+    PunctualLight sun;
+    sun.name = "sun";
+    sun.kind = PunctualKind::kDirectional;
+    sun.direction = -NormalizeOr(changes.sun->to_sun, Vec3d(0, 1, 0));
+    sun.intensity = changes.sun->irradiance;
+    scene.lights = {std::move(sun)};
+  }
+  if (changes.sky) scene.environment.sky = *changes.sky;
+  if (changes.view) {
+    FP_ASSIGN_OR_RETURN(const Camera camera, CameraOf(*changes.view));
+    scene.cameras = {camera};
+  }
+  return made;
 }
 
 }  // namespace farpoint

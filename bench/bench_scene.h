@@ -1,9 +1,11 @@
 // Where a benchmark's scene comes from.
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
+#include "bench/accuracy_scenes.h"
 #include "core/base/status.h"
 #include "core/scene/scene.h"
 
@@ -15,9 +17,17 @@ struct BenchScene {
   std::vector<std::string> notes;
 };
 
+// In place of what the scene has.
+struct SceneChanges {
+  std::optional<AccuracySun> sun;    // of its punctual lights
+  std::optional<Rgb> sky;            // W/(m² sr)
+  std::optional<AccuracyView> view;  // of its camera
+};
+
 // "cornell", "city" (four blocks by four, two by two if `small`) and "furnace" (reflectance 0.5,
 // radiance 1) are the project's own scenes and always the same; everything else is a glTF file. The
 // scene has a camera and a light. Errors are those of CollectAsset and ImportScene.
-absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small);
+absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small,
+                                          const SceneChanges& changes = {});
 
 }  // namespace farpoint

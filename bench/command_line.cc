@@ -36,6 +36,24 @@ bool ParseVec3(std::string_view text, Vec3d& out) {
   return at == end && IsFinite(out);
 }
 
+absl::StatusOr<AccuracySun> ParseSun(const std::string& text) {
+  const size_t colon = text.find(':');
+  Vec3d to_sun, irradiance;
+  if (colon == std::string::npos || !ParseVec3(text.substr(0, colon), to_sun) ||
+      !ParseVec3(text.substr(colon + 1), irradiance) || MaxAbs(to_sun) == 0) {
+    return absl::InvalidArgumentError("--sun " + text + " is not x,y,z:r,g,b");
+  }
+  return AccuracySun{to_sun, Rgb(irradiance)};
+}
+
+absl::StatusOr<Rgb> ParseSky(const std::string& text) {
+  Vec3d radiance;
+  if (!ParseVec3(text, radiance)) {
+    return absl::InvalidArgumentError("--sky " + text + " is not r,g,b");
+  }
+  return Rgb(radiance);
+}
+
 void AddCommonOptions(CLI::App& app, std::string& output_dir, bool& quick) {
   app.add_option("-o,--output", output_dir, "Folder of the results; made if it is not there")
       ->capture_default_str();
@@ -83,6 +101,21 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                    "Paths per pixel of the traced reference [8192, quick: 2048]")
       ->excludes(reference)
       ->check(CLI::Range(8u, 1u << 20));
+  std::string pareto_sun, pareto_sky, eye, target;
+  double fov_deg = 45;
+  std::vector<std::string> curves;
+  pareto->add_option("--sun", pareto_sun, "x,y,z:r,g,b, as of farpoint render");
+  pareto->add_option("--sky", pareto_sky, "r,g,b, as of farpoint render");
+  CLI::Option* eye_option = pareto->add_option("--eye", eye, "x,y,z: a free camera, +y up");
+  CLI::Option* target_option =
+      pareto->add_option("--target", target, "x,y,z that it looks at")->needs(eye_option);
+  eye_option->needs(target_option);
+  pareto->add_option("--fov", fov_deg, "Its vertical field of view, degrees")
+      ->capture_default_str()
+      ->needs(eye_option)
+      ->check(CLI::Range(1.0, 170.0));
+  pareto->add_option("--curves", curves, "Some of adaptive,k,pbgi,dpbgi,pt,irrcache [all]")
+      ->delimiter(',');
   pareto->add_option("--points", p.points, "Surfels [by the scene, quick: 20000]")
       ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
   pareto->add_option("--light-samples", p.light_samples, "Shadow rays, as of farpoint render")
@@ -246,21 +279,34 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   a.fill = *asked_fill;
   r.cache_bytes = cache_mib << 20;
   if (!sun.empty()) {
-    const size_t colon = sun.find(':');
-    Vec3d to_sun, irradiance;
-    if (colon == std::string::npos || !ParseVec3(sun.substr(0, colon), to_sun) ||
-        !ParseVec3(sun.substr(colon + 1), irradiance) || MaxAbs(to_sun) == 0) {
-      return absl::InvalidArgumentError("--sun " + sun + " is not x,y,z:r,g,b");
-    }
-    r.to_sun = to_sun;
-    r.sun = Rgb(irradiance);
+    FP_ASSIGN_OR_RETURN(const AccuracySun parsed, ParseSun(sun));
+    r.to_sun = parsed.to_sun;
+    r.sun = parsed.irradiance;
   }
   if (!sky.empty()) {
-    Vec3d radiance;
-    if (!ParseVec3(sky, radiance)) {
-      return absl::InvalidArgumentError("--sky " + sky + " is not r,g,b");
+    FP_ASSIGN_OR_RETURN(r.sky, ParseSky(sky));
+  }
+  if (!pareto_sun.empty()) {
+    FP_ASSIGN_OR_RETURN(p.changes.sun, ParseSun(pareto_sun));
+  }
+  if (!pareto_sky.empty()) {
+    FP_ASSIGN_OR_RETURN(p.changes.sky, ParseSky(pareto_sky));
+  }
+  if (!eye.empty()) {
+    AccuracyView view;
+    view.yfov_deg = fov_deg;
+    if (!ParseVec3(eye, view.eye)) {
+      return absl::InvalidArgumentError("--eye " + eye + " is not x,y,z");
     }
-    r.sky = Rgb(radiance);
+    if (!ParseVec3(target, view.target)) {
+      return absl::InvalidArgumentError("--target " + target + " is not x,y,z");
+    }
+    p.changes.view = view;
+  }
+  for (const std::string& curve : curves) {
+    const absl::StatusOr<ParetoCurve> parsed = ParetoCurveFromName(curve);
+    if (!parsed.ok()) return Annotate(parsed.status(), "--curves");
+    p.curves.push_back(*parsed);
   }
   if (resolution_option->count() > 0 && !ParseResolution(resolution, p.width, p.height)) {
     return absl::InvalidArgumentError("--resolution " + resolution +

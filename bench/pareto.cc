@@ -35,12 +35,33 @@ constexpr double kLimitedByNoise = 2.0;
 struct Sweep {
   std::vector<uint32_t> clusters, fpbgi_buffers, pbgi_buffers, dpbgi_buffers, paths;
   std::vector<float> epsilons;
+  std::vector<Quality> qualities;
+  std::vector<double> cache_errors;
+  std::vector<uint32_t> cache_samples;
 };
 
 Sweep SweepOf(bool quick) {
-  if (quick) return {{8, 32}, {8, 16}, {16, 24}, {6, 8}, {4, 32, 256}, {0.1f, 0.2f}};
-  return {{25, 100, 200},     {16, 24, 32},        {24, 32, 48},
-          {6, 8, 12, 16, 20}, {16, 64, 256, 1024}, {0.05f, 0.1f, 0.2f}};
+  const std::vector<Quality> qualities = {Quality::kDraft, Quality::kNormal, Quality::kFine};
+  if (quick) {
+    return {.clusters = {8, 32},
+            .fpbgi_buffers = {8, 16},
+            .pbgi_buffers = {16, 24},
+            .dpbgi_buffers = {6, 8},
+            .paths = {4, 32, 256},
+            .epsilons = {0.1f, 0.2f},
+            .qualities = qualities,
+            .cache_errors = {0.2, 0.4},
+            .cache_samples = {64, 256}};
+  }
+  return {.clusters = {25, 100, 200},
+          .fpbgi_buffers = {16, 24, 32},
+          .pbgi_buffers = {24, 32, 48},
+          .dpbgi_buffers = {6, 8, 12, 16, 20},
+          .paths = {16, 64, 256, 1024},
+          .epsilons = {0.05f, 0.1f, 0.2f},
+          .qualities = qualities,
+          .cache_errors = {0.08, 0.12, 0.2, 0.3, 0.5},
+          .cache_samples = {256, 512, 1024, 2048}};
 }
 
 double SecondsSince(std::chrono::steady_clock::time_point start) {
@@ -198,10 +219,16 @@ RenderSettings SettingsOf(const ParetoPoint& point, const ParetoOptions& options
   s.integrator = point.integrator;
   s.seed = options.seed;
   s.light_samples = options.light_samples;
-  if (point.paths != 0) s.paths = point.paths;
+  if (point.integrator == Integrator::kIrrcache) {
+    s.cache_error = static_cast<float>(point.cache_error);
+    s.cache_samples = point.paths;
+  } else if (point.paths != 0) {
+    s.paths = point.paths;
+  }
+  if (point.quality) s.quality = *point.quality;
   s.clusters = point.clusters;
   s.microbuffer = point.microbuffer;
-  if (point.integrator == Integrator::kFpbgi) s.epsilon = static_cast<float>(point.epsilon);
+  if (point.clusters != 0) s.epsilon = static_cast<float>(point.epsilon);
   // Irradiance alone: no direct light is computed, and black receivers are gathered like others.
   s.layers = {Layer::kIrradiance};
   return s;
@@ -213,6 +240,7 @@ std::vector<ParetoPoint> Configurations(const Sweep& sweep) {
     points.emplace_back().integrator = integrator;
     return points.back();
   };
+  for (const Quality quality : sweep.qualities) add(Integrator::kFpbgi).quality = quality;
   for (const uint32_t k : sweep.clusters) {
     for (const float epsilon : sweep.epsilons) {
       for (const uint32_t side : sweep.fpbgi_buffers) {
@@ -227,6 +255,13 @@ std::vector<ParetoPoint> Configurations(const Sweep& sweep) {
   for (const uint32_t side : sweep.pbgi_buffers) add(Integrator::kPbgi).microbuffer = side;
   for (const uint32_t side : sweep.dpbgi_buffers) add(Integrator::kDpbgi).microbuffer = side;
   for (const uint32_t paths : sweep.paths) add(Integrator::kPt).paths = paths;
+  for (const double error : sweep.cache_errors) {
+    for (const uint32_t samples : sweep.cache_samples) {
+      ParetoPoint& p = add(Integrator::kIrrcache);
+      p.cache_error = error;
+      p.paths = samples;
+    }
+  }
   return points;
 }
 
@@ -275,7 +310,7 @@ absl::StatusOr<Baked> BakeRepeatedly(const Scene& scene, const RenderSettings& s
   return baked;
 }
 
-// Where the curve through pt's points, straight between them in logarithms, has error `rr`.
+// Where the curve through the points, straight between them in logarithms, has error `rr`.
 std::optional<double> SecondsAt(const std::vector<const ParetoPoint*>& by_time, double rr) {
   for (size_t i = 0; i + 1 < by_time.size(); ++i) {
     const ParetoPoint &a = *by_time[i], &b = *by_time[i + 1];
@@ -294,13 +329,48 @@ Spread SpreadOf(std::vector<double> values) {
   return {0.5 * (values[(n - 1) / 2] + values[n / 2]), values.front(), values.back()};
 }
 
+ParetoCurve ParetoPoint::curve() const {
+  switch (integrator) {
+    case Integrator::kFpbgi:
+      return clusters == 0 ? ParetoCurve::kAdaptive : ParetoCurve::kKMeans;
+    case Integrator::kPbgi:
+      return ParetoCurve::kPbgi;
+    case Integrator::kDpbgi:
+      return ParetoCurve::kDpbgi;
+    case Integrator::kPt:
+      return ParetoCurve::kPt;
+    case Integrator::kIrrcache:
+      break;
+  }
+  return ParetoCurve::kIrrcache;
+}
+
+std::string_view NameOf(ParetoCurve curve) {
+  static constexpr std::array<std::string_view, kParetoCurveCount> kNames = {
+      "fpbgi adaptive", "fpbgi k", "pbgi", "dpbgi", "pt", "irrcache"};
+  return kNames[static_cast<size_t>(curve)];
+}
+
+absl::StatusOr<ParetoCurve> ParetoCurveFromName(std::string_view name) {
+  static constexpr std::array<std::string_view, kParetoCurveCount> kFlagNames = {
+      "adaptive", "k", "pbgi", "dpbgi", "pt", "irrcache"};
+  for (size_t i = 0; i < kFlagNames.size(); ++i) {
+    if (kFlagNames[i] == name) return static_cast<ParetoCurve>(i);
+  }
+  return absl::InvalidArgumentError(
+      Concat({"unknown curve '", name, "'; use some of adaptive, k, pbgi, dpbgi, pt, irrcache"}));
+}
+
 std::string LabelOf(const ParetoPoint& p) {
   switch (p.integrator) {
     case Integrator::kFpbgi:
+      if (p.clusters == 0) return std::string(NameOf(p.quality.value_or(Quality::kNormal)));
       return absl::StrFormat("k=%d ε=%g %d²", p.clusters, p.epsilon, p.microbuffer);
     case Integrator::kPbgi:
     case Integrator::kDpbgi:
       return absl::StrFormat("%d²", p.microbuffer);
+    case Integrator::kIrrcache:
+      return absl::StrFormat("a=%g %d rays", p.cache_error, p.paths);
     case Integrator::kPt:
       break;
   }
@@ -308,22 +378,31 @@ std::string LabelOf(const ParetoPoint& p) {
 }
 
 void AnalysePoints(std::span<ParetoPoint> points) {
-  std::vector<const ParetoPoint*> pt;
-  for (const ParetoPoint& p : points) {
-    if (p.integrator != Integrator::kPt || p.reference_limited) continue;
-    if (p.rr > 0 && p.gather.median > 0) pt.push_back(&p);
-  }
-  std::sort(pt.begin(), pt.end(), [](const ParetoPoint* a, const ParetoPoint* b) {
-    return a->gather.median < b->gather.median;
-  });
   for (ParetoPoint& p : points) {
     p.on_front = std::none_of(points.begin(), points.end(), [&](const ParetoPoint& q) {
-      return q.integrator == p.integrator && q.gather.median <= p.gather.median && q.rr <= p.rr &&
+      return q.curve() == p.curve() && q.gather.median <= p.gather.median && q.rr <= p.rr &&
              (q.gather.median < p.gather.median || q.rr < p.rr);
     });
+  }
+  const auto front_of = [&](Integrator integrator) {
+    std::vector<const ParetoPoint*> front;
+    for (const ParetoPoint& p : points) {
+      if (p.integrator != integrator || p.reference_limited || !p.on_front) continue;
+      if (p.rr > 0 && p.gather.median > 0) front.push_back(&p);
+    }
+    std::sort(front.begin(), front.end(), [](const ParetoPoint* a, const ParetoPoint* b) {
+      return a->gather.median < b->gather.median;
+    });
+    return front;
+  };
+  const auto pt = front_of(Integrator::kPt), cache = front_of(Integrator::kIrrcache);
+  for (ParetoPoint& p : points) {
     p.pt_seconds_at_rr.reset();
-    if (p.integrator != Integrator::kPt && !p.reference_limited && p.rr > 0) {
-      p.pt_seconds_at_rr = SecondsAt(pt, p.rr);
+    p.irrcache_seconds_at_rr.reset();
+    if (p.reference_limited || !(p.rr > 0)) continue;
+    if (p.integrator != Integrator::kPt) p.pt_seconds_at_rr = SecondsAt(pt, p.rr);
+    if (p.integrator != Integrator::kIrrcache && p.integrator != Integrator::kPt) {
+      p.irrcache_seconds_at_rr = SecondsAt(cache, p.rr);
     }
   }
 }
@@ -377,7 +456,8 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
         mask->rect.width(), mask->rect.height(), options.width, options.height));
   }
 
-  FP_ASSIGN_OR_RETURN(BenchScene source, MakeBenchScene(options.scene, options.quick));
+  FP_ASSIGN_OR_RETURN(BenchScene source,
+                      MakeBenchScene(options.scene, options.quick, options.changes));
   report.notes = std::move(source.notes);
   frame.camera = source.scene.cameras.front();
 
@@ -401,6 +481,12 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
     load.push_back(ProcessCpuSeconds() - cpu);
   }
   report.load = SpreadOf(load);
+  {
+    // The first renderer of a scene that reads surfels makes the atlas, which the scene keeps.
+    const double cpu = ProcessCpuSeconds();
+    FP_RETURN_IF_ERROR(MakeRenderer(frame, RenderSettings()).status());
+    report.atlas = SpreadOf({ProcessCpuSeconds() - cpu});
+  }
   report.triangles = baked.stats.counts["triangles"];
   report.surfels = baked.stats.counts["surfels"];
   report.nodes = baked.stats.counts["nodes"];
@@ -426,11 +512,13 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
   report.reference_seconds = reference.seconds;
 
   report.points = Configurations(SweepOf(options.quick));
-  const size_t count = report.points.size();
-  std::vector<std::unique_ptr<FrameRenderer>> renderers;
-  for (const ParetoPoint& point : report.points) {
-    FP_ASSIGN_OR_RETURN(renderers.emplace_back(), MakeRenderer(frame, SettingsOf(point, options)));
+  if (!options.curves.empty()) {
+    std::erase_if(report.points, [&](const ParetoPoint& p) {
+      return std::find(options.curves.begin(), options.curves.end(), p.curve()) ==
+             options.curves.end();
+    });
   }
+  const size_t count = report.points.size();
   std::vector<StageSamples> stages(count);
   std::vector<std::vector<double>> gather(count), wall(count);
   for (unsigned round = 0; round < options.repeat; ++round) {
@@ -438,15 +526,18 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
       ParetoPoint& point = report.points[i];
       progress(absl::StrFormat("round %d of %d, %d of %d: %s %s", round + 1, options.repeat, i + 1,
                                count, NameOf(point.integrator), LabelOf(point)));
+      // A new one each time: a renderer keeps records and caches from tile to tile.
+      FP_ASSIGN_OR_RETURN(const auto renderer, MakeRenderer(frame, SettingsOf(point, options)));
       const auto start = std::chrono::steady_clock::now();
-      FP_ASSIGN_OR_RETURN(const TileOutput out, RenderFrame(frame, *renderers[i]));
+      FP_ASSIGN_OR_RETURN(const TileOutput out, RenderFrame(frame, *renderer));
       wall[i].push_back(SecondsSince(start));
       stages[i].Add(out.stats.seconds);
       gather[i].push_back(GatherSeconds(out.stats));
       const std::string hash = LayerHash(out.film, Layer::kIrradiance).Hex();
       if (round > 0) {
-        if (hash == point.hash) continue;
-        return absl::InternalError(Concat({NameOf(point.integrator), " ", LabelOf(point),
+        // The same work, too: a renderer that kept something would be fast for nothing.
+        if (hash == point.hash && out.stats.counts == point.counts) continue;
+        return absl::InternalError(Concat({NameOf(point.curve()), " ", LabelOf(point),
                                            ": two renders differ; a defect of farpoint"}));
       }
       point.hash = hash;

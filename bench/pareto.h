@@ -12,23 +12,34 @@
 #include <string_view>
 #include <vector>
 
+#include "bench/bench_scene.h"
 #include "core/base/stats.h"
 #include "core/base/status.h"
 #include "core/render/settings.h"
 
 namespace farpoint {
 
+// What a line joins: the points of one integrator, of one kind of clusters.
+enum class ParetoCurve { kAdaptive, kKMeans, kPbgi, kDpbgi, kPt, kIrrcache };
+inline constexpr int kParetoCurveCount = 6;
+// "fpbgi adaptive", "fpbgi k", "pbgi", …
+std::string_view NameOf(ParetoCurve curve);
+// From a name as of a flag: adaptive, k, pbgi, dpbgi, pt, irrcache. kInvalidArgument lists them.
+absl::StatusOr<ParetoCurve> ParetoCurveFromName(std::string_view name);
+
 // 0 and empty mean the default named at the field; after the comma, that of a quick run.
 struct ParetoOptions {
   std::string scene = "cornell";  // see MakeBenchScene
-  int width = 0, height = 0;      // the reference file's; without one 256x256, 64x64
-  std::string reference_path;     // an EXR; empty: a path-traced one is made
-  std::string ref_layer;          // of the file: its "irradiance" or, without one, R, G and B
-  std::string mask_path;          // see ReadMask; empty: the pixels whose primary ray hits
-  std::optional<double> noise;    // the file's standard error over its mean; none: unknown, as 0
-  uint32_t reference_paths = 0;   // of the reference made here: 8192, 2048
-  uint64_t points = 0;            // surfels: the scene's default, 20,000
-  uint32_t light_samples = 32;    // of the surfels, see RenderSettings
+  SceneChanges changes;
+  int width = 0, height = 0;        // the reference file's; without one 256x256, 64x64
+  std::string reference_path;       // an EXR; empty: a path-traced one is made
+  std::string ref_layer;            // of the file: its "irradiance" or, without one, R, G and B
+  std::string mask_path;            // see ReadMask; empty: the pixels whose primary ray hits
+  std::optional<double> noise;      // the file's standard error over its mean; none: unknown, as 0
+  uint32_t reference_paths = 0;     // of the reference made here: 8192, 2048
+  std::vector<ParetoCurve> curves;  // what to measure; empty: all
+  uint64_t points = 0;              // surfels: the scene's default, 20,000
+  uint32_t light_samples = 32;      // of the surfels, see RenderSettings
   uint64_t seed = 0;
   unsigned repeat = 0;   // renders of each configuration: 3, 1
   unsigned threads = 0;  // all cores
@@ -44,9 +55,13 @@ Spread SpreadOf(std::vector<double> values);  // not empty
 // One setting of one integrator. Seconds are thread-seconds unless they are called wall.
 struct ParetoPoint {
   Integrator integrator = Integrator::kFpbgi;
-  // What an integrator does not have is 0.
+  // What an integrator does not have is 0 or none. paths: also the rays of irrcache's records.
   uint32_t clusters = 0, microbuffer = 0, paths = 0;
   double epsilon = 0;
+  std::optional<Quality> quality;  // adaptive clusters
+  double cache_error = 0;          // irrcache
+
+  ParetoCurve curve() const;
 
   Spread gather;                          // cluster + cut + raster + composite + convolve + trace
   std::array<Spread, kStageCount> stage;  // of the tile; preparation stages are 0
@@ -60,11 +75,12 @@ struct ParetoPoint {
   // rel_rmse is below twice the reference's noise: rr says more about the reference than about the
   // point.
   bool reference_limited = false;
-  // No other point of its integrator is as fast and as accurate and better in one of the two.
+  // No other point of its curve is as fast and as accurate and better in one of the two.
   bool on_front = false;
-  // Thread-seconds that pt would need for this rr, interpolated between its points in logarithms;
-  // none beyond their range, where the reference limits, and for pt itself.
-  std::optional<double> pt_seconds_at_rr;
+  // Thread-seconds that pt and irrcache would need for this rr, interpolated in logarithms between
+  // the points of their fronts; none beyond their range, where the reference limits, and for the
+  // two themselves.
+  std::optional<double> pt_seconds_at_rr, irrcache_seconds_at_rr;
 };
 
 struct PreparationTimes {
@@ -91,16 +107,18 @@ struct ParetoReport {
   double reference_seconds = 0;  // thread-seconds; 0 for a file
 
   PreparationTimes point_based;  // what fpbgi, pbgi and dpbgi need before their first pixel
-  PreparationTimes path_traced;  // what pt needs
+  PreparationTimes path_traced;  // what pt and irrcache need
   Spread load;                   // ray acceleration structure and light tables; everyone needs it
+  Spread atlas;                  // which surfels lie about a hit; adaptive clusters need it
 
-  std::vector<ParetoPoint> points;  // by integrator, in the order of the enumeration
+  std::vector<ParetoPoint> points;  // by curve
 };
 
 // Bakes the scene, makes or reads the reference, renders every configuration `repeat` times (in
 // rounds, so that a slow minute of the machine hits all alike) and compares. `progress` gets a line
 // now and then. kInvalidArgument: settings, a reference or a mask that do not fit, a scene without
-// indirect light, whose errors would have no scale. kInternal if two repeats differ in a bit.
+// indirect light, whose errors would have no scale. kInternal if two repeats differ in a bit or in
+// what was counted.
 //
 // The reference's own noise comes from the stderr layer, which errs on the high side: rr, which has
 // it taken out, errs on the low side, rel_rmse does not. The reference is made with another seed:
@@ -108,10 +126,10 @@ struct ParetoReport {
 absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& options,
                                        const std::function<void(std::string_view)>& progress);
 
-// "k=100 ε=0.1 24²", "64 paths"
+// "normal", "k=100 ε=0.1 24²", "64 paths", "a=0.2 1024 rays"
 std::string LabelOf(const ParetoPoint& point);
 
-// Sets on_front and pt_seconds_at_rr of every point from times and errors.
+// Sets on_front and the peers' seconds of every point from times and errors.
 void AnalysePoints(std::span<ParetoPoint> points);
 
 }  // namespace farpoint

@@ -16,12 +16,34 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-// By integrator; told apart in most kinds of colour blindness (Okabe and Ito).
-constexpr std::array kIntegrators = {Integrator::kFpbgi, Integrator::kPbgi, Integrator::kDpbgi,
-                                     Integrator::kPt};
-constexpr std::array kColors = {"#0072b2", "#e69f00", "#cc79a7", "#009e73"};
+// By curve; told apart in most kinds of colour blindness (Okabe and Ito).
+constexpr std::array<const char*, kParetoCurveCount> kColors = {"#0072b2", "#56b4e9", "#e69f00",
+                                                                "#cc79a7", "#009e73", "#d55e00"};
+
+constexpr std::array kCurves = {ParetoCurve::kAdaptive, ParetoCurve::kKMeans,
+                                ParetoCurve::kPbgi,     ParetoCurve::kDpbgi,
+                                ParetoCurve::kPt,       ParetoCurve::kIrrcache};
+static_assert(kCurves.size() == kParetoCurveCount);
 
 Json ToJson(const Spread& s) { return {{"median", s.median}, {"min", s.min}, {"max", s.max}}; }
+
+Json ToJson(const Vec3d& v) { return {v.x, v.y, v.z}; }
+
+// As the flags say it; null where the scene's own is in force.
+Json ToJson(const SceneChanges& c) {
+  Json json = {{"sun", nullptr}, {"sky", nullptr}, {"view", nullptr}};
+  if (c.sun) {
+    json["sun"] = {{"to_sun", ToJson(c.sun->to_sun)},
+                   {"irradiance", ToJson(Vec3d(c.sun->irradiance))}};
+  }
+  if (c.sky) json["sky"] = ToJson(Vec3d(*c.sky));
+  if (c.view) {
+    json["view"] = {{"eye", ToJson(c.view->eye)},
+                    {"target", ToJson(c.view->target)},
+                    {"yfov_deg", c.view->yfov_deg}};
+  }
+  return json;
+}
 
 template <typename T>
 Json OrNull(const std::optional<T>& value) {
@@ -55,10 +77,12 @@ Json ToJson(const ParetoPoint& p) {
   }
   return {
       {"label", LabelOf(p)},
+      {"quality", p.quality ? Json(NameOf(*p.quality)) : Json()},
       {"clusters", OrNull(p.clusters != 0, p.clusters)},
       {"epsilon", OrNull(p.clusters != 0, p.epsilon)},
       {"microbuffer", OrNull(p.microbuffer != 0, p.microbuffer)},
       {"paths", OrNull(p.paths != 0, p.paths)},
+      {"cache_error", OrNull(p.cache_error != 0, p.cache_error)},
       {"seconds", seconds},
       {"wall_seconds", ToJson(p.wall)},
       {"us_per_receiver", p.us_per_receiver},
@@ -68,15 +92,16 @@ Json ToJson(const ParetoPoint& p) {
       {"reference_limited", p.reference_limited},
       {"on_front", p.on_front},
       {"pt_seconds_at_rr", OrNull(p.pt_seconds_at_rr)},
+      {"irrcache_seconds_at_rr", OrNull(p.irrcache_seconds_at_rr)},
       {"counts", p.counts},
       {"hash", p.hash},
   };
 }
 
-std::vector<const ParetoPoint*> ByTime(const ParetoReport& report, Integrator integrator) {
+std::vector<const ParetoPoint*> ByTime(const ParetoReport& report, ParetoCurve curve) {
   std::vector<const ParetoPoint*> points;
   for (const ParetoPoint& p : report.points) {
-    if (p.integrator == integrator) points.push_back(&p);
+    if (p.curve() == curve) points.push_back(&p);
   }
   std::stable_sort(points.begin(), points.end(), [](const ParetoPoint* a, const ParetoPoint* b) {
     return a->gather.median < b->gather.median;
@@ -117,9 +142,10 @@ std::string SpreadText(const Spread& s) {
   return absl::StrFormat("%.4g [%.4g, %.4g]", s.median, s.min, s.max);
 }
 
-std::string SpeedupText(const ParetoPoint& p) {
-  if (!p.pt_seconds_at_rr || !(p.gather.median > 0)) return "";
-  return absl::StrFormat("%.3g×", *p.pt_seconds_at_rr / p.gather.median);
+// How many times the point's own time a peer needs; empty where it cannot be told.
+std::string SpeedupText(const ParetoPoint& p, const std::optional<double>& peer_seconds) {
+  if (!peer_seconds || !(p.gather.median > 0)) return "";
+  return absl::StrFormat("%.3g", *peer_seconds / p.gather.median);
 }
 
 std::string FlagsText(const ParetoPoint& p) {
@@ -133,9 +159,9 @@ LogLogPlot PlotOf(const ParetoReport& report) {
   LogLogPlot plot;
   plot.x_label = "gather, thread-seconds for the frame (median; bar: fastest to slowest repeat)";
   plot.y_label = "error rr of irradiance";
-  for (size_t i = 0; i < kIntegrators.size(); ++i) {
-    PlotSeries series{std::string(NameOf(kIntegrators[i])), kColors[i], {}};
-    for (const ParetoPoint* p : ByTime(report, kIntegrators[i])) {
+  for (const ParetoCurve curve : kCurves) {
+    PlotSeries series{std::string(NameOf(curve)), kColors[static_cast<size_t>(curve)], {}};
+    for (const ParetoPoint* p : ByTime(report, curve)) {
       series.points.push_back({p->gather.median, p->rr, p->gather.min, p->gather.max,
                                absl::StrFormat("%s %s: %s s, rr %.4f, bias %+.4f", series.name,
                                                LabelOf(*p), SpreadText(p->gather), p->rr, p->bias),
@@ -185,6 +211,7 @@ std::string ParetoJson(const ParetoReport& r) {
         {"load_average", {{"start", r.load_average_start}, {"end", r.load_average_end}}}}},
       {"scene",
        {{"name", o.scene},
+        {"changes", ToJson(o.changes)},
         {"notes", r.notes},
         {"triangles", r.triangles},
         {"surfels", r.surfels},
@@ -215,13 +242,14 @@ std::string ParetoJson(const ParetoReport& r) {
       {"preparation",
        {{"point_based", ToJson(r.point_based)},
         {"pt", ToJson(r.path_traced)},
-        {"load", ToJson(r.load)}}},
+        {"load", ToJson(r.load)},
+        {"atlas", ToJson(r.atlas)}}},
   };
   json["curves"] = Json::array();
-  for (const Integrator integrator : kIntegrators) {
+  for (const ParetoCurve curve : kCurves) {
     Json points = Json::array();
-    for (const ParetoPoint* p : ByTime(r, integrator)) points.push_back(ToJson(*p));
-    json["curves"].push_back({{"integrator", NameOf(integrator)}, {"points", points}});
+    for (const ParetoPoint* p : ByTime(r, curve)) points.push_back(ToJson(*p));
+    json["curves"].push_back({{"curve", NameOf(curve)}, {"points", points}});
   }
   // A file name may be anything but UTF-8.
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
@@ -247,23 +275,24 @@ std::string ParetoHtml(const ParetoReport& r) {
   for (const std::string& note : r.notes) item("Note", note);
   Append(html, {"</dl>\n", svg,
                 "<p>Lower left is better: less time, less error. Lines join the points of an "
-                "integrator that none of its other points beats in both; points off the line are "
+                "curve that none of its other points beats in both; points off the line are "
                 "faint. Rings: the reference's noise is more than half of the error."});
   if (left_out > 0) {
     Append(html, {" ", std::to_string(left_out),
                   " points have an error or a time of zero and are in the table only."});
   }
-  Append(html,
-         {"</p>\n<h2>Points</h2>\n<div class='wide'><table>\n",
-          Row("th", {"integrator", "setting", "gather, thread-s [min, max]", "µs/receiver", "rr",
-                     "rel. RMSE", "bias", "× pt at equal rr", "wall s [min, max]", "remarks"})});
-  for (const Integrator integrator : kIntegrators) {
-    for (const ParetoPoint* p : ByTime(r, integrator)) {
-      html +=
-          Row("td", {std::string(NameOf(integrator)), LabelOf(*p), SpreadText(p->gather),
-                     absl::StrFormat("%.3g", p->us_per_receiver), absl::StrFormat("%.4f", p->rr),
-                     absl::StrFormat("%.4f", p->rel_rmse), absl::StrFormat("%+.4f", p->bias),
-                     SpeedupText(*p), SpreadText(p->wall), FlagsText(*p)});
+  Append(html, {"</p>\n<h2>Points</h2>\n<div class='wide'><table>\n",
+                Row("th", {"curve", "setting", "gather, thread-s [min, max]", "µs/receiver", "rr",
+                           "rel. RMSE", "bias", "× pt at equal rr", "× irrcache at equal rr",
+                           "wall s [min, max]", "remarks"})});
+  for (const ParetoCurve curve : kCurves) {
+    for (const ParetoPoint* p : ByTime(r, curve)) {
+      html += Row("td",
+                  {std::string(NameOf(curve)), LabelOf(*p), SpreadText(p->gather),
+                   absl::StrFormat("%.3g", p->us_per_receiver), absl::StrFormat("%.4f", p->rr),
+                   absl::StrFormat("%.4f", p->rel_rmse), absl::StrFormat("%+.4f", p->bias),
+                   SpeedupText(*p, p->pt_seconds_at_rr), SpeedupText(*p, p->irrcache_seconds_at_rr),
+                   SpreadText(p->wall), FlagsText(*p)});
     }
   }
   Append(html, {"</table></div>\n<h2>Preparation</h2>\n<p>Thread-seconds once per scene, "
@@ -278,41 +307,42 @@ std::string ParetoHtml(const ParetoReport& r) {
     html += Row("td", cells);
   };
   preparation("fpbgi, pbgi, dpbgi", r.point_based);
-  preparation("pt", r.path_traced);
+  preparation("pt, irrcache", r.path_traced);
   return Concat({html,
                  "</table></div>\n<p>Loading (ray acceleration structure, light tables; "
                  "everyone needs it): ",
-                 SpreadText(r.load), " thread-seconds.</p>\n", "</body></html>\n"});
+                 SpreadText(r.load), " thread-seconds. The surfels about a hit, for adaptive ",
+                 "clusters: ", SpreadText(r.atlas), ".</p>\n", "</body></html>\n"});
 }
 
 std::string ParetoTable(const ParetoReport& r) {
   std::string table =
       Concat({"scene      ", SceneText(r), "\nfilm       ", FilmText(r), "\nreference  ",
               ReferenceText(r), "\nmachine    ", MachineText(r), "\n\n"});
-  absl::StrAppendFormat(&table, "%-7s%-18s%33s%12s%9s%9s%9s%9s  %s\n", "", "setting",
+  absl::StrAppendFormat(&table, "%-15s%-18s%33s%12s%9s%9s%9s%9s%11s  %s\n", "", "setting",
                         "gather s [min, max]", "us/receiver", "rr", "relRMSE", "bias", "x pt",
-                        "remarks");
-  for (const Integrator integrator : kIntegrators) {
-    for (const ParetoPoint* p : ByTime(r, integrator)) {
+                        "x irrcache", "remarks");
+  for (const ParetoCurve curve : kCurves) {
+    for (const ParetoPoint* p : ByTime(r, curve)) {
       // Widths count bytes: the few signs beyond ASCII are written without them here.
       std::string label;
-      if (integrator == Integrator::kFpbgi) {
+      if (curve == ParetoCurve::kKMeans) {
         label = absl::StrFormat("k=%d eps=%g %dpx", p->clusters, p->epsilon, p->microbuffer);
-      } else if (integrator == Integrator::kPt) {
-        label = LabelOf(*p);
-      } else {
+      } else if (curve == ParetoCurve::kPbgi || curve == ParetoCurve::kDpbgi) {
         label = absl::StrFormat("%dpx", p->microbuffer);
+      } else {
+        label = LabelOf(*p);
       }
-      std::string speedup = SpeedupText(*p);
-      if (!speedup.empty()) speedup.replace(speedup.find("×"), std::string_view("×").size(), "x");
-      absl::StrAppendFormat(&table, "%-7s%-18s%33s%12.3g%9.4f%9.4f%+9.4f%9s  %s\n",
-                            NameOf(integrator), label, SpreadText(p->gather), p->us_per_receiver,
-                            p->rr, p->rel_rmse, p->bias, speedup, FlagsText(*p));
+      absl::StrAppendFormat(&table, "%-15s%-18s%33s%12.3g%9.4f%9.4f%+9.4f%9s%11s  %s\n",
+                            NameOf(curve), label, SpreadText(p->gather), p->us_per_receiver, p->rr,
+                            p->rel_rmse, p->bias, SpeedupText(*p, p->pt_seconds_at_rr),
+                            SpeedupText(*p, p->irrcache_seconds_at_rr), FlagsText(*p));
     }
   }
-  Append(table, {"\npreparation, thread-seconds once per scene: ", SpreadText(r.point_based.total),
-                 " (fpbgi, pbgi, dpbgi), ", SpreadText(r.path_traced.total), " (pt), loading ",
-                 SpreadText(r.load), "\n"});
+  Append(table,
+         {"\npreparation, thread-seconds once per scene: ", SpreadText(r.point_based.total),
+          " (fpbgi, pbgi, dpbgi), ", SpreadText(r.path_traced.total), " (pt, irrcache), loading ",
+          SpreadText(r.load), ", surfels about hits ", SpreadText(r.atlas), "\n"});
   return table;
 }
 

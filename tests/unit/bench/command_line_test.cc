@@ -41,6 +41,29 @@ TEST(BenchCommandLine, ParetoTakesAll) {
   EXPECT_TRUE(p.quick);
 }
 
+TEST(BenchCommandLine, ParetoChangesTheSceneAndChoosesCurves) {
+  const auto line = ParseBenchCommandLine(
+      {"pareto", "--scene", "s.gltf", "--sun", "0.3,1,0.1:10,9,8", "--sky", "0.5,0.6,0.8", "--eye",
+       "9,0.8,-0.3", "--target", "-8,4,-0.3", "--fov", "57", "--curves", "adaptive,pt,irrcache"});
+  ASSERT_TRUE(line.ok()) << line.status();
+  const ParetoOptions& p = line->pareto;
+  ASSERT_TRUE(p.changes.sun && p.changes.sky && p.changes.view);
+  EXPECT_EQ(p.changes.sun->to_sun, Vec3d(0.3, 1, 0.1));
+  EXPECT_EQ(p.changes.sun->irradiance, Rgb(10, 9, 8));
+  EXPECT_EQ(*p.changes.sky, Rgb(0.5f, 0.6f, 0.8f));
+  EXPECT_EQ(p.changes.view->eye, Vec3d(9, 0.8, -0.3));
+  EXPECT_EQ(p.changes.view->target, Vec3d(-8, 4, -0.3));
+  EXPECT_EQ(p.changes.view->yfov_deg, 57);
+  EXPECT_EQ(p.curves,
+            (std::vector{ParetoCurve::kAdaptive, ParetoCurve::kPt, ParetoCurve::kIrrcache}));
+  EXPECT_THAT(MessageOf({"pareto", "--sun", "1,2,3"}), HasSubstr("--sun 1,2,3"));
+  EXPECT_THAT(MessageOf({"pareto", "--sky", "1,2"}), HasSubstr("--sky 1,2"));
+  EXPECT_THAT(MessageOf({"pareto", "--eye", "1,2,3"}), HasSubstr("--target"));
+  EXPECT_THAT(MessageOf({"pareto", "--target", "1,2,3"}), HasSubstr("--eye"));
+  EXPECT_THAT(MessageOf({"pareto", "--eye", "x", "--target", "1,2,3"}), HasSubstr("--eye x"));
+  EXPECT_THAT(MessageOf({"pareto", "--curves", "pt,no"}), HasSubstr("'no'"));
+}
+
 TEST(BenchCommandLine, ParetoNeedsNothing) {
   const auto line = ParseBenchCommandLine({"pareto"});
   ASSERT_TRUE(line.ok()) << line.status();

@@ -26,20 +26,22 @@ TEST(ParetoJson, HasEveryKey) {
   ExpectKeys(json, {"benchmark", "version", "date_utc", "quick", "machine", "scene", "film",
                     "settings", "reference", "preparation", "curves"});
   ExpectKeys(json["machine"], {"cpu", "threads", "load_average"});
-  ExpectKeys(json["scene"], {"name", "notes", "triangles", "surfels", "nodes", "bytes", "hash"});
+  ExpectKeys(json["scene"],
+             {"name", "changes", "notes", "triangles", "surfels", "nodes", "bytes", "hash"});
   ExpectKeys(json["film"], {"width", "height", "spp", "receivers", "compared_pixels"});
   ExpectKeys(json["settings"], {"seed", "light_samples", "repeat", "buffer_map", "splat"});
   ExpectKeys(json["reference"],
              {"kind", "file", "layer", "mask", "paths", "seconds", "mean", "noise"});
-  ExpectKeys(json["preparation"], {"point_based", "pt", "load"});
+  ExpectKeys(json["preparation"], {"point_based", "pt", "load", "atlas"});
   ExpectKeys(json["preparation"]["point_based"], {"import", "sample", "shade", "tree", "total"});
-  ASSERT_EQ(json["curves"].size(), 4u);
+  ASSERT_EQ(json["curves"].size(), 6u);
   for (const Json& curve : json["curves"]) {
-    ExpectKeys(curve, {"integrator", "points"});
+    ExpectKeys(curve, {"curve", "points"});
     for (const Json& p : curve["points"]) {
-      ExpectKeys(p, {"label", "clusters", "epsilon", "microbuffer", "paths", "seconds",
-                     "wall_seconds", "us_per_receiver", "rr", "rel_rmse", "bias",
-                     "reference_limited", "on_front", "pt_seconds_at_rr", "counts", "hash"});
+      ExpectKeys(p, {"label", "quality", "clusters", "epsilon", "microbuffer", "paths",
+                     "cache_error", "seconds", "wall_seconds", "us_per_receiver", "rr", "rel_rmse",
+                     "bias", "reference_limited", "on_front", "pt_seconds_at_rr",
+                     "irrcache_seconds_at_rr", "counts", "hash"});
       ExpectKeys(p["seconds"], {"gather", "primary", "direct", "cluster", "cut", "raster",
                                 "composite", "convolve", "trace"});
       ExpectKeys(p["seconds"]["gather"], {"median", "min", "max"});
@@ -66,13 +68,27 @@ TEST(ParetoJson, GatherIsTheSumOfItsStages) {
 TEST(ParetoJson, SettingsThatDoNotExistAreNull) {
   ASSERT_TRUE(TinyReport().ok()) << TinyReport().status();
   const Json json = Json::parse(ParetoJson(*TinyReport()));
-  EXPECT_EQ(json["curves"][0]["integrator"], "fpbgi");
-  EXPECT_TRUE(json["curves"][0]["points"][0]["paths"].is_null());
-  EXPECT_TRUE(json["curves"][0]["points"][0]["epsilon"].is_number());
-  EXPECT_EQ(json["curves"][3]["integrator"], "pt");
-  EXPECT_TRUE(json["curves"][3]["points"][0]["clusters"].is_null());
-  EXPECT_TRUE(json["curves"][3]["points"][0]["epsilon"].is_null());
-  EXPECT_TRUE(json["curves"][3]["points"][0]["paths"].is_number());
+  struct Case {
+    size_t curve;
+    const char* name;
+    std::vector<const char*> numbers;
+  };
+  for (const Case& c :
+       {Case{0, "fpbgi adaptive", {}}, Case{1, "fpbgi k", {"clusters", "epsilon", "microbuffer"}},
+        Case{2, "pbgi", {"microbuffer"}}, Case{3, "dpbgi", {"microbuffer"}},
+        Case{4, "pt", {"paths"}}, Case{5, "irrcache", {"paths", "cache_error"}}}) {
+    EXPECT_EQ(json["curves"][c.curve]["curve"], c.name);
+    const Json& point = json["curves"][c.curve]["points"][0];
+    EXPECT_EQ(point["quality"].is_string(), c.curve == 0);
+    for (const char* key : {"clusters", "epsilon", "microbuffer", "paths", "cache_error"}) {
+      const bool has = std::find_if(c.numbers.begin(), c.numbers.end(), [&](const char* number) {
+                         return std::string_view(number) == key;
+                       }) != c.numbers.end();
+      EXPECT_EQ(point[key].is_number(), has) << c.name << " " << key;
+      EXPECT_EQ(point[key].is_null(), !has) << c.name << " " << key;
+    }
+  }
+  EXPECT_TRUE(json["scene"]["changes"]["sun"].is_null());
   EXPECT_EQ(json["reference"]["kind"], "pt");
   EXPECT_TRUE(json["reference"]["file"].is_null());
 }
@@ -116,8 +132,8 @@ TEST(ParetoHtml, EveryPointIsInPlotAndTable) {
   for (const ParetoPoint& p : TinyReport()->points) {
     EXPECT_THAT(html, HasSubstr("<td>" + LabelOf(p) + "</td>"));
     if (p.rr > 0) {
-      EXPECT_THAT(
-          html, HasSubstr("<title>" + std::string(NameOf(p.integrator)) + " " + LabelOf(p) + ": "));
+      EXPECT_THAT(html,
+                  HasSubstr("<title>" + std::string(NameOf(p.curve())) + " " + LabelOf(p) + ": "));
     }
   }
 }
@@ -145,8 +161,8 @@ TEST(ParetoHtml, PointsWithoutPlaceAreSaid) {
 TEST(ParetoTable, SaysTimeAndErrorOfEveryPoint) {
   ASSERT_TRUE(TinyReport().ok()) << TinyReport().status();
   const std::string table = ParetoTable(*TinyReport());
-  for (const char* word :
-       {"gather s", "rr", "bias", "reference", "preparation", "4 paths", "k=8 eps=0.1 16px"}) {
+  for (const char* word : {"gather s", "rr", "bias", "reference", "preparation", "4 paths",
+                           "k=8 eps=0.1 16px", "draft", "a=0.2 64 rays", "x irrcache"}) {
     EXPECT_THAT(table, HasSubstr(word));
   }
   const auto lines = std::count(table.begin(), table.end(), '\n');

@@ -15,10 +15,10 @@ namespace {
 
 using ::testing::HasSubstr;
 
-std::vector<const ParetoPoint*> PointsOf(const ParetoReport& report, Integrator integrator) {
+std::vector<const ParetoPoint*> PointsOf(const ParetoReport& report, ParetoCurve curve) {
   std::vector<const ParetoPoint*> points;
   for (const ParetoPoint& p : report.points) {
-    if (p.integrator == integrator) points.push_back(&p);
+    if (p.curve() == curve) points.push_back(&p);
   }
   return points;
 }
@@ -37,7 +37,7 @@ TEST(Pareto, EveryCurveHasItsPoints) {
   const ParetoReport& r = *TinyReport();
   std::set<uint32_t> k, buffers;
   std::set<double> epsilons;
-  for (const ParetoPoint* p : PointsOf(r, Integrator::kFpbgi)) {
+  for (const ParetoPoint* p : PointsOf(r, ParetoCurve::kKMeans)) {
     k.insert(p->clusters);
     epsilons.insert(p->epsilon);
     buffers.insert(p->microbuffer);
@@ -45,9 +45,20 @@ TEST(Pareto, EveryCurveHasItsPoints) {
   EXPECT_GE(k.size(), 2u);
   EXPECT_GE(epsilons.size(), 2u);
   EXPECT_GE(buffers.size(), 2u);
-  EXPECT_GE(PointsOf(r, Integrator::kPbgi).size(), 2u);
-  EXPECT_GE(PointsOf(r, Integrator::kDpbgi).size(), 2u);
-  EXPECT_GE(PointsOf(r, Integrator::kPt).size(), 3u);
+  EXPECT_GE(PointsOf(r, ParetoCurve::kPbgi).size(), 2u);
+  EXPECT_GE(PointsOf(r, ParetoCurve::kDpbgi).size(), 2u);
+  EXPECT_GE(PointsOf(r, ParetoCurve::kPt).size(), 3u);
+  std::set<Quality> qualities;
+  for (const ParetoPoint* p : PointsOf(r, ParetoCurve::kAdaptive)) qualities.insert(*p->quality);
+  EXPECT_EQ(qualities.size(), 3u);
+  std::set<double> errors;
+  std::set<uint32_t> rays;
+  for (const ParetoPoint* p : PointsOf(r, ParetoCurve::kIrrcache)) {
+    errors.insert(p->cache_error);
+    rays.insert(p->paths);
+  }
+  EXPECT_GE(errors.size(), 2u);
+  EXPECT_GE(rays.size(), 2u);
 }
 
 TEST(Pareto, TimesArePositiveAndErrorsFinite) {
@@ -67,11 +78,11 @@ TEST(Pareto, TimesArePositiveAndErrorsFinite) {
     EXPECT_EQ(p.hash.size(), 64u);
     // Irradiance alone is rendered: no time may hide in other stages.
     EXPECT_LT(p.stage[static_cast<int>(Stage::kDirect)].max, p.gather.max);
-    const bool pt = p.integrator == Integrator::kPt;
-    EXPECT_EQ(p.stage[static_cast<int>(Stage::kTrace)].median > 0, pt);
-    EXPECT_EQ(p.stage[static_cast<int>(Stage::kRaster)].median > 0, !pt);
-    EXPECT_EQ(p.stage[static_cast<int>(Stage::kCluster)].median > 0,
-              p.integrator == Integrator::kFpbgi);
+    const ParetoCurve curve = p.curve();
+    const bool by_rays = curve == ParetoCurve::kPt || curve == ParetoCurve::kIrrcache ||
+                         curve == ParetoCurve::kAdaptive;
+    EXPECT_EQ(p.stage[static_cast<int>(Stage::kTrace)].median > 0, by_rays);
+    EXPECT_EQ(p.stage[static_cast<int>(Stage::kRaster)].median > 0, !by_rays);
   }
   EXPECT_GT(r.point_based.total.min, r.path_traced.total.min);
   EXPECT_GT(r.point_based.stage[static_cast<int>(Stage::kTree)].min, 0);
@@ -81,7 +92,7 @@ TEST(Pareto, TimesArePositiveAndErrorsFinite) {
 
 TEST(Pareto, PathTracersErrorFallsWithPaths) {
   ASSERT_TRUE(TinyReport().ok()) << TinyReport().status();
-  const auto points = PointsOf(*TinyReport(), Integrator::kPt);
+  const auto points = PointsOf(*TinyReport(), ParetoCurve::kPt);
   for (size_t i = 0; i + 1 < points.size(); ++i) {
     EXPECT_LT(points[i]->paths, points[i + 1]->paths);
     EXPECT_GT(points[i]->rel_rmse, points[i + 1]->rel_rmse);
@@ -136,6 +147,56 @@ TEST(Pareto, FrontHoldsWhatNothingBeats) {
   EXPECT_TRUE(points[2].on_front);
   EXPECT_FALSE(points[3].on_front);
   EXPECT_TRUE(points[4].on_front);
+}
+
+TEST(Pareto, KindsOfClustersAreCurvesOfTheirOwn) {
+  std::vector<ParetoPoint> points = {Made(Integrator::kFpbgi, 1, 0.1),
+                                     Made(Integrator::kFpbgi, 2, 0.2)};
+  points[1].clusters = 16;
+  AnalysePoints(points);
+  EXPECT_TRUE(points[0].on_front);
+  EXPECT_TRUE(points[1].on_front);  // beaten by another curve only
+}
+
+TEST(Pareto, CachesTimeIsThatOfItsFront) {
+  std::vector<ParetoPoint> points = {
+      Made(Integrator::kIrrcache, 1, 0.4), Made(Integrator::kIrrcache, 4, 0.1),
+      Made(Integrator::kIrrcache, 9, 0.3),  // beaten, counts for nothing
+      Made(Integrator::kFpbgi, 1, 0.2), Made(Integrator::kPt, 1, 0.2)};
+  AnalysePoints(points);
+  EXPECT_NEAR(points[3].irrcache_seconds_at_rr.value_or(0), 2.0, 1e-12);
+  EXPECT_FALSE(points[0].irrcache_seconds_at_rr.has_value());
+  EXPECT_FALSE(points[4].irrcache_seconds_at_rr.has_value());  // pt is measured by pt alone
+}
+
+TEST(Pareto, CurvesHaveNames) {
+  const char* names[] = {"adaptive", "k", "pbgi", "dpbgi", "pt", "irrcache"};
+  for (int i = 0; i < kParetoCurveCount; ++i) {
+    const auto curve = ParetoCurveFromName(names[i]);
+    ASSERT_TRUE(curve.ok()) << curve.status();
+    EXPECT_EQ(*curve, static_cast<ParetoCurve>(i));
+  }
+  EXPECT_THAT(std::string(ParetoCurveFromName("fpbgi").status().message()),
+              HasSubstr("adaptive, k, pbgi, dpbgi, pt, irrcache"));
+}
+
+TEST(Pareto, ChangedSceneAndChosenCurves) {
+  ParetoOptions options = TinyOptions();
+  options.curves = {ParetoCurve::kIrrcache};
+  const auto plain = RunPareto(options, [](std::string_view) {});
+  ASSERT_TRUE(plain.ok()) << plain.status();
+  for (const ParetoPoint& p : plain->points) EXPECT_EQ(p.curve(), ParetoCurve::kIrrcache);
+  ASSERT_FALSE(plain->points.empty());
+  // Another light and another camera are another picture.
+  options.changes.sun = AccuracySun{{0.1, 0.2, -1}, Rgb(20, 20, 20)};
+  options.changes.view = AccuracyView{{2.7, 2.7, -4}, {2.7, 2.5, 5}, 40};
+  const auto changed = RunPareto(options, [](std::string_view) {});
+  ASSERT_TRUE(changed.ok()) << changed.status();
+  EXPECT_NE(changed->points[0].hash, plain->points[0].hash);
+  EXPECT_NE(changed->scene_hash, plain->scene_hash);
+  // Straight down is no camera whose up is +y.
+  options.changes.view = AccuracyView{{0, 3, 0}, {0, 0, 0}, 40};
+  EXPECT_FALSE(RunPareto(options, [](std::string_view) {}).ok());
 }
 
 TEST(Pareto, PathTracersTimeIsInterpolatedInLogarithms) {
