@@ -60,7 +60,7 @@ Sweep SweepOf(bool quick) {
           .paths = {16, 64, 256, 1024},
           .epsilons = {0.05f, 0.1f, 0.2f},
           .qualities = qualities,
-          .cache_errors = {0.08, 0.12, 0.2, 0.3, 0.5},
+          .cache_errors = {0.08, 0.12, 0.2, 0.3, 0.45},
           .cache_samples = {256, 512, 1024, 2048}};
 }
 

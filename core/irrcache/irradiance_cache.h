@@ -46,7 +46,7 @@ inline constexpr float kBehind = 0.05f;
 struct IrradianceCacheParams {
   float error = 0.2f;       // a > 0: smaller, more records
   uint32_t samples = 1024;  // strata of a record's hemisphere, >= 1
-  float least_px = 4.0f;    // least and greatest r, in sides of a projected pixel
+  float least_px = 2.4f;    // least and greatest r, in sides of a projected pixel
   float most_px = 64.0f;
   float enough = 0.2f;  // summed weight that spares a pixel a record
   // Times which r receivers see the records: more records smooth each other's noise, and the edges

@@ -104,7 +104,7 @@ IrradianceCacheParams CacheOf(const RenderSettings& settings) {
   p.seed = settings.seed;
   p.error = settings.cache_error_in_force();
   // A finer cache is finer in corners too.
-  p.least_px = std::clamp(20 * p.error, 1.5f, 6.0f);
+  p.least_px = std::clamp(12 * p.error, 1.0f, 6.0f);
   p.samples = settings.cache_samples_in_force();
   return p;
 }

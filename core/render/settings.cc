@@ -20,7 +20,7 @@ constexpr std::array<std::string_view, 4> kFilterNames = {"box", "triangle", "ga
 constexpr std::array<std::string_view, 3> kFillNames = {"auto", "rays", "cut"};
 constexpr std::array<std::string_view, 3> kQualityNames = {"draft", "normal", "fine"};
 // Of irrcache, by quality: docs/decisions/0016-irradiance-cache.md has the figures.
-constexpr std::array<float, 3> kCacheErrors = {0.3f, 0.2f, 0.12f};
+constexpr std::array<float, 3> kCacheErrors = {0.3f, 0.2f, 0.1f};
 constexpr std::array<uint32_t, 3> kCacheSamples = {512, 1024, 2048};
 constexpr std::array<float, 4> kFilterWidths = {1.0f, 2.0f, 3.0f, 3.0f};
 
