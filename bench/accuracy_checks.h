@@ -36,20 +36,22 @@ struct PixelPair {
 std::vector<PixelPair> SmoothPairs(const Film& film);
 double JumpOf(const Film& film, const PixelPair& pair);
 
-// Across `period_px` or not across any multiple of 8 pixels; the rest belongs to neither.
+// Jumps across the multiples of `period_px`, and across the lines 3, 4 and 5 pixels to either side
+// of each of those pairs, so that both see the same surfaces. Pairs without a smooth one beside
+// them do not count. The standard error is that of the means of runs of 32 pairs along a border, as
+// pairs within a run are not independent.
 struct JumpFigures {
-  size_t pairs = 0, pairs_elsewhere = 0;
-  double jump = 0, jump_elsewhere = 0;  // means
-  double excess_error = 0;              // standard error of jump - jump_elsewhere
+  size_t pairs = 0;
+  double jump = 0, jump_beside = 0;  // means
+  double excess_error = 0;           // standard error of jump - jump_beside
 };
 JumpFigures GridJumps(const Film& film, std::span<const PixelPair> pairs, int period_px);
 
 // "seams-cornell" (the box, 256x256) or "seams-sponza" (its floor and walls, 640x500, sun):
 // - jumps across the borders of 8 (groups of pixels that are blended together), 32 (blocks) and
-//   128 pixels (tiles) over jumps elsewhere, whole frame;
-// - the step across borders of clusters against pt's step at the same pairs, over the same
-//   elsewhere: sqrt(M_border - M_elsewhere), M the mean square of (step - pt's step) over the local
-//   value; pt's noise is in both and cancels.
+//   128 pixels (tiles) over those beside them, whole frame;
+// - |step - pt's step| across borders of clusters over that elsewhere, as parts of the true local
+//   value (at least a twentieth of the mean), means over pairs. pt's noise is in both.
 // Nothing, with `missing` set, if the scene is not there.
 absl::StatusOr<std::optional<AccuracyCheck>> CheckSeams(std::string_view name,
                                                         const AccuracyContext& context,
