@@ -58,6 +58,7 @@ absl::Status RunMicro(const MicroOptions& options, std::ostream& out) {
   RegisterPointTreeBenchmarks(*work);
   RegisterSurfelBenchmarks(*work);
   RegisterRayAccelBenchmarks(*work);
+  RegisterPathTracerBenchmarks(*work);
   benchmark::ConsoleReporter console(benchmark::ConsoleReporter::OO_Tabular);
   console.SetOutputStream(&out);
   const size_t ran = benchmark::RunSpecifiedBenchmarks(&console);

@@ -95,6 +95,7 @@ void MakeViews(MicroWorkload& work) {
 
 absl::StatusOr<std::unique_ptr<MicroWorkload>> MicroWorkload::Make(bool quick) {
   auto work = std::make_unique<MicroWorkload>();
+  work->quick = quick;
   work->description = MakeCornellBox();
   const Scene& scene = work->description;
   FP_ASSIGN_OR_RETURN(work->scene, PreparedScene::Prepare(scene, work->executor));

@@ -37,6 +37,7 @@ struct MicroWorkload {
   // 100,000 surfels and the middle block of 256x256 pixels; quick: 5,000, of 64x64.
   static absl::StatusOr<std::unique_ptr<MicroWorkload>> Make(bool quick);
 
+  bool quick = false;
   Executor executor{1};
   uint64_t surfel_count = 0;  // asked for
   ShadeOptions shade;
@@ -83,5 +84,6 @@ void RegisterMicrobufferBenchmarks(const MicroWorkload& work);
 void RegisterPointTreeBenchmarks(MicroWorkload& work);
 void RegisterSurfelBenchmarks(MicroWorkload& work);
 void RegisterRayAccelBenchmarks(const MicroWorkload& work);
+void RegisterPathTracerBenchmarks(MicroWorkload& work);
 
 }  // namespace farpoint

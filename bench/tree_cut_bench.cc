@@ -1,11 +1,13 @@
 // tree_cut/alone/MAP   the cut of one receiver from the root (pbgi), the block's receivers in turn
 // tree_cut/cluster     the cut shared by a cluster (§3.2), far and near, the clusters in turn
 // tree_cut/receiver    a receiver's own cut below its cluster's near nodes (§3.3)
+// tree_cut/same_cuts   the cuts of alone, and the same by the call for clusters, by turns
 // tree_cut/pack        copying a cluster's near nodes into groups
 // tree_cut/sort        ordering a receiver's cut from the root front to back
 #include <algorithm>
 
 #include "bench/micro_workload.h"
+#include "core/base/clock.h"
 
 namespace farpoint {
 
@@ -49,6 +51,41 @@ void Cluster(benchmark::State& state, const MicroWorkload& work) {
     if (++i == work.cluster_views.size()) i = 0;
   }
   SetCutCounters(state, static_cast<double>(state.iterations()), "clusters_per_s", counters, nodes);
+}
+
+// The cuts of pbgi's receivers, and the same by the call that fpbgi's clusters make, by turns.
+void SameCuts(benchmark::State& state, const MicroWorkload& work) {
+  const CutParams params = work.cut_params(BufferMap::kOctahedral);
+  std::vector<CutNode> pbgi, fpbgi;
+  std::vector<NearNode> near;
+  CutCounters pbgi_counters, fpbgi_counters;
+  double pbgi_s = 0, fpbgi_s = 0;
+  for (auto _ : state) {
+    // A pass over all receivers each: reading the clock costs nothing then.
+    const double start = ThreadCpuSeconds();
+    for (const CutView& view : work.receiver_views) {
+      pbgi.clear();
+      ComputeClusterCut(*work.tree, view, params, pbgi, nullptr, pbgi_counters);
+    }
+    const double middle = ThreadCpuSeconds();
+    for (const CutView& view : work.receiver_views) {
+      fpbgi.clear();
+      near.clear();
+      ComputeClusterCut(*work.tree, view, params, fpbgi, &near, fpbgi_counters);
+    }
+    const double end = ThreadCpuSeconds();
+    pbgi_s += middle - start;
+    fpbgi_s += end - middle;
+  }
+  if (pbgi_counters.groups_visited != fpbgi_counters.groups_visited || !near.empty() ||
+      pbgi.size() != fpbgi.size()) {
+    state.SkipWithError("the two made different cuts");
+    return;
+  }
+  const double groups = static_cast<double>(pbgi_counters.groups_visited);
+  state.counters["pbgi_node_groups_per_s"] = groups / pbgi_s;
+  state.counters["fpbgi_node_groups_per_s"] = groups / fpbgi_s;
+  state.counters["pbgi_over_fpbgi"] = fpbgi_s / pbgi_s;
 }
 
 void ReceiverCut(benchmark::State& state, const MicroWorkload& work) {
@@ -116,6 +153,9 @@ void RegisterTreeCutBenchmarks(const MicroWorkload& work) {
   benchmark::RegisterBenchmark("tree_cut/cluster", [&](benchmark::State& s) { Cluster(s, work); });
   benchmark::RegisterBenchmark("tree_cut/receiver",
                                [&](benchmark::State& s) { ReceiverCut(s, work); });
+  benchmark::RegisterBenchmark("tree_cut/same_cuts", [&](benchmark::State& s) {
+    SameCuts(s, work);
+  })->Unit(benchmark::kMillisecond);
   benchmark::RegisterBenchmark("tree_cut/pack", [&](benchmark::State& s) { Pack(s, work); });
   benchmark::RegisterBenchmark("tree_cut/sort", [&](benchmark::State& s) { Sort(s, work); });
 }

@@ -60,8 +60,9 @@ RayAccel::RayAccel(std::shared_ptr<const PreparedScene> scene)
 RayAccel::~RayAccel() = default;
 
 absl::StatusOr<std::shared_ptr<const RayAccel>> RayAccel::Build(
-    std::shared_ptr<const PreparedScene> scene) {
+    std::shared_ptr<const PreparedScene> scene, std::vector<TracedRay>* record) {
   std::shared_ptr<RayAccel> accel(new RayAccel(std::move(scene)));
+  accel->record_ = record;
   Impl& impl = *accel->impl_;
   impl.device = rtcNewDevice("isa=avx2");
   if (!impl.device) {
@@ -105,6 +106,7 @@ absl::StatusOr<std::shared_ptr<const RayAccel>> RayAccel::Build(
 
 std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& direction,
                                           float t_max) const {
+  if (record_ != nullptr) record_->push_back({origin, direction, t_max, false});
   RTCRayHit query;
   FillRay(query.ray, origin, direction, t_max);
   query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
@@ -121,6 +123,7 @@ std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& dire
 }
 
 bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max) const {
+  if (record_ != nullptr) record_->push_back({origin, direction, t_max, true});
   RTCRay ray;
   FillRay(ray, origin, direction, t_max);
 #if RTC_VERSION_MAJOR >= 4
@@ -131,6 +134,38 @@ bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max
   rtcOccluded1(impl_->scene, &context, &ray);
 #endif
   return ray.tfar < 0.0f;
+}
+
+size_t RayAccel::TraceBare(std::span<const TracedRay> rays) const {
+  size_t hits = 0;
+#if RTC_VERSION_MAJOR < 4
+  RTCIntersectContext context;
+  rtcInitIntersectContext(&context);
+#endif
+  for (const TracedRay& r : rays) {
+    if (r.any_hit) {
+      RTCRay ray;
+      FillRay(ray, r.origin, r.direction, r.t_max);
+#if RTC_VERSION_MAJOR >= 4
+      rtcOccluded1(impl_->scene, &ray);
+#else
+      rtcOccluded1(impl_->scene, &context, &ray);
+#endif
+      hits += ray.tfar < 0.0f;
+    } else {
+      RTCRayHit query;
+      FillRay(query.ray, r.origin, r.direction, r.t_max);
+      query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+      query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+#if RTC_VERSION_MAJOR >= 4
+      rtcIntersect1(impl_->scene, &query);
+#else
+      rtcIntersect1(impl_->scene, &context, &query);
+#endif
+      hits += query.hit.geomID != RTC_INVALID_GEOMETRY_ID;
+    }
+  }
+  return hits;
 }
 
 }  // namespace farpoint

@@ -12,6 +12,8 @@
 #include <limits>
 #include <memory>
 #include <optional>
+#include <span>
+#include <vector>
 
 #include "core/base/status.h"
 #include "core/scene/prepared_scene.h"
@@ -24,13 +26,21 @@ struct RayHit {
   float b1, b2;       // barycentric weights of vertices 1 and 2
 };
 
+// A query as it was made.
+struct TracedRay {
+  Vec3f origin, direction;
+  float t_max;
+  bool any_hit;  // Occluded, not Intersect
+};
+
 // Immutable after Build; thread-safe. Coordinates are relative to the scene's origin. Alpha masks
 // are holes. For performance the queries check nothing: inputs must be finite.
 class RayAccel {
  public:
   // kUnavailable if Embree reports an error (out of memory, no AVX2), with Embree's words.
+  // For measurements: with `record` every query is appended to it, and only one thread may query.
   static absl::StatusOr<std::shared_ptr<const RayAccel>> Build(
-      std::shared_ptr<const PreparedScene> scene);
+      std::shared_ptr<const PreparedScene> scene, std::vector<TracedRay>* record = nullptr);
   ~RayAccel();
   RayAccel(const RayAccel&) = delete;
   RayAccel& operator=(const RayAccel&) = delete;
@@ -44,6 +54,10 @@ class RayAccel {
   bool Occluded(const Vec3f& origin, const Vec3f& direction,
                 float t_max = std::numeric_limits<float>::infinity()) const;
 
+  // For measurements: the same queries by nothing but Embree's own calls, one ray after the other.
+  // Returns how many hit.
+  size_t TraceBare(std::span<const TracedRay> rays) const;
+
   // Where a ray leaves a surface at `p` on the side of the unit geometric normal `ng`: p moved by
   // 2^-19 of the scene's diagonal, about eight times the rounding error of a position, so that the
   // ray does not hit the surface that it leaves. Proportional to the scene: no absolute length.
@@ -56,6 +70,7 @@ class RayAccel {
   struct Impl;
   std::shared_ptr<const PreparedScene> scene_;
   float surface_offset_m_ = 0;
+  std::vector<TracedRay>* record_ = nullptr;
   std::unique_ptr<Impl> impl_;
 };
 

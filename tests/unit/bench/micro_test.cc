@@ -21,6 +21,8 @@ const std::map<std::string, std::vector<std::string>> kBenchmarks = {
     {"tree_cut/alone/cosine", {"receivers_per_s", "node_groups_per_s", "nodes_per_cut"}},
     {"tree_cut/cluster", {"clusters_per_s", "node_groups_per_s", "nodes_per_cut"}},
     {"tree_cut/receiver", {"receivers_per_s", "node_groups_per_s", "nodes_per_cut"}},
+    {"tree_cut/same_cuts",
+     {"pbgi_node_groups_per_s", "fpbgi_node_groups_per_s", "pbgi_over_fpbgi"}},
     {"tree_cut/pack", {"nodes_per_s"}},
     {"tree_cut/sort", {"nodes_per_s", "nodes_per_cut"}},
     {"microbuffer/map/octahedral", {"pixels_per_s"}},
@@ -45,6 +47,8 @@ const std::map<std::string, std::vector<std::string>> kBenchmarks = {
     {"ray_accel/intersect/coherent", {"rays_per_s", "hit_fraction"}},
     {"ray_accel/intersect/incoherent", {"rays_per_s", "hit_fraction"}},
     {"ray_accel/occluded/incoherent", {"rays_per_s", "hit_fraction"}},
+    {"path_tracer/against_embree/cornell",
+     {"pt_rays_per_s", "embree_rays_per_s", "pt_over_embree"}},
 };
 
 TEST(Micro, EveryKernelRunsAndCounts) {

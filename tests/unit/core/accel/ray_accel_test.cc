@@ -444,5 +444,36 @@ TEST(RayAccel, IsTheSameWhenBuiltAgain) {
   }
 }
 
+TEST(RayAccel, RecordsItsQueriesAndBareCallsAnswerThemAlike) {
+  Executor executor(1);
+  const auto prepared = PreparedScene::Prepare(MakeSoup(200, 0.3, 5), executor);
+  ASSERT_TRUE(prepared.ok());
+  std::vector<TracedRay> rays;
+  const auto recorder = RayAccel::Build(*prepared, &rays);
+  const auto accel = RayAccel::Build(*prepared);
+  ASSERT_TRUE(recorder.ok() && accel.ok());
+  TestRandom random(6);
+  size_t hits = 0;
+  for (int i = 0; i < 500; ++i) {
+    const Vec3f origin(random.Direction() * 2.0), direction(random.Direction());
+    const float t_max = i % 3 == 0 ? 1.5f : std::numeric_limits<float>::infinity();
+    if (i % 2 == 0) {
+      hits += (*recorder)->Intersect(origin, direction, t_max).has_value();
+    } else {
+      hits += (*recorder)->Occluded(origin, direction, t_max);
+    }
+    ASSERT_EQ(rays.size(), static_cast<size_t>(i) + 1);
+    EXPECT_EQ(rays.back().origin, origin);
+    EXPECT_EQ(rays.back().direction, direction);
+    EXPECT_EQ(rays.back().t_max, t_max);
+    EXPECT_EQ(rays.back().any_hit, i % 2 != 0);
+  }
+  EXPECT_GT(hits, 20u);
+  EXPECT_LT(hits, 480u);
+  EXPECT_EQ((*accel)->TraceBare(rays), hits);
+  EXPECT_EQ(rays.size(), 500u);
+  EXPECT_EQ((*accel)->TraceBare({}), 0u);
+}
+
 }  // namespace
 }  // namespace farpoint
