@@ -34,7 +34,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
     const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
     if (!(MaxComponent(surface.albedo) > 0.0f)) continue;
     Vec3f ng = scene.GeometricNormal(hit->triangle);
-    Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
+    Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2, ng);
     if (Dot(ng, w) > 0.0f) {
       ng = -ng;
       ns = -ns;

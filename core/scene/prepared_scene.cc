@@ -930,9 +930,9 @@ Vec3f PreparedScene::PointOn(uint32_t triangle, float b1, float b2) const {
   return a + (vertices_[v[1]] - a) * b1 + (vertices_[v[2]] - a) * b2;
 }
 
-Vec3f PreparedScene::ShadingNormal(uint32_t triangle, float b1, float b2) const {
+Vec3f PreparedScene::ShadingNormal(uint32_t triangle, float b1, float b2,
+                                   const Vec3f& n_geometric) const {
   const PreparedTriangle& t = triangles_[triangle];
-  const Vec3f n_geometric = GeometricNormal(triangle);
   if (objects_[t.object].has_normals == 0) return n_geometric;
   const Vec3f sum = normals_[t.vertex[0]] * (1.0f - b1 - b2) + normals_[t.vertex[1]] * b1 +
                     normals_[t.vertex[2]] * b2;

@@ -145,7 +145,11 @@ class PreparedScene {
   Vec3f PointOn(uint32_t triangle, float b1, float b2) const;
   // Interpolated and normalised, on the side of the geometric normal; the geometric normal where
   // the mesh has none.
-  Vec3f ShadingNormal(uint32_t triangle, float b1, float b2) const;
+  Vec3f ShadingNormal(uint32_t triangle, float b1, float b2) const {
+    return ShadingNormal(triangle, b1, b2, GeometricNormal(triangle));
+  }
+  // The same for who has GeometricNormal(triangle) at hand.
+  Vec3f ShadingNormal(uint32_t triangle, float b1, float b2, const Vec3f& geometric_normal) const;
   // Textures are looked up bilinearly (or nearest where the file says so), in linear light, on
   // their finest level.
   SurfaceSample Surface(uint32_t triangle, float b1, float b2) const;
