@@ -190,8 +190,10 @@ absl::StatusOr<AccuracyCheck> CheckFlicker(std::string_view name, const Accuracy
   const Flicker pt_fresh = FlickerOf(fresh, truth);
   AccuracyCheck check;
   check.name = name;
+  const std::string instead =
+      missing.empty() ? "" : Concat({" (in place of Sponza: ", missing, ")"});
   check.setup = Concat(
-      {CommandOf(c),
+      {CommandOf(c), instead,
        absl::StrFormat("; %d frames, %s by %g degrees each; %d pixels; truth: pt, noise up to "
                        "%.4f, taken out; %.1f us/receiver, in which pt has %d paths",
                        frames, pan ? "the camera turns" : "the sun turns", kTurnDeg, pixels.size(),

@@ -124,6 +124,7 @@ std::string AccuracyTable(const AccuracyReport& r) {
     for (Row& row : RowsOf(check)) rows.push_back(std::move(row));
   }
   if (!r.checks.empty()) Append(text, {r.results.empty() ? "" : "\n", TextTable(rows, 2)});
+  for (const AccuracyCheck& check : r.checks) Append(text, {check.name, ": ", check.setup, "\n"});
   for (const LeftOut& out : r.left_out) Append(text, {"left out: ", out.name, ": ", out.why, "\n"});
   return text;
 }

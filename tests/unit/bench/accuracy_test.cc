@@ -133,6 +133,7 @@ TEST(Accuracy, LeavesItsReports) {
   ASSERT_EQ(code, 0) << err.str();
   EXPECT_THAT(out.str(), HasSubstr("--quality draft"));
   EXPECT_THAT(out.str(), HasSubstr("left out: seams-sponza"));
+  EXPECT_THAT(out.str(), HasSubstr("flicker-pan: city --resolution 48x32"));
   const auto json = nlohmann::json::parse(ReadText(folder / "out/accuracy.json"));
   EXPECT_EQ(json["benchmark"], "accuracy");
   ASSERT_EQ(json["cases"].size(), 1u);
