@@ -240,6 +240,11 @@ class SceneRun {
     FP_RETURN_IF_ERROR(RenderDpbgi());
     FP_RETURN_IF_ERROR(CompareWithPbgi());
     FP_RETURN_IF_ERROR(CompareWithTruth());
+    // The sweep may take as long again: what stands is said now.
+    Say(absl::StrFormat(
+        "gather %.4g and %.4g thread-seconds by pbgi and fpbgi, MSE %.3g, rr %.4f and %.4f",
+        report_.pbgi.times.gather, report_.fpbgi.times.gather, report_.fpbgi.difference->mse,
+        report_.pbgi.truth.rr, report_.fpbgi.truth.rr));
     FP_RETURN_IF_ERROR(RunSweep());
     report_.load_average_end = LoadAverage();
     return std::move(report_);
