@@ -55,6 +55,21 @@ HemisphereGrid::HemisphereGrid(uint32_t samples) {
   }
 }
 
+namespace {
+
+// sin²θ = u and φ = 2 pi v, eight at a time.
+void StoreDirections8(F8 u, F8 v, float* x, float* y, float* z) {
+  const F8 sin2 = Min8(u, Set8(1.0f));
+  F8 sine, cosine;
+  SinCosTurns8(Min8(v, Set8(1.0f)), sine, cosine);
+  const F8 r = Sqrt8(sin2);
+  Store8(x, r * cosine);
+  Store8(y, r * sine);
+  Store8(z, Sqrt8(Max8(Set8(1.0f) - sin2, Set8(0.0f))));
+}
+
+}  // namespace
+
 void HemisphereGrid::Directions(uint64_t key, float* x, float* y, float* z) const {
   const float inverse_rings = 1.0f / static_cast<float>(rings_);
   const float inverse_sectors = 1.0f / static_cast<float>(sectors_);
@@ -67,18 +82,34 @@ void HemisphereGrid::Directions(uint64_t key, float* x, float* y, float* z) cons
         v[i] = (static_cast<float>(k + i) + ToUnitFloat(static_cast<uint32_t>(random >> 32))) *
                inverse_sectors;
       }
-      const F8 sin2 = Min8(Load8(u), Set8(1.0f));
-      F8 sine, cosine;
-      SinCosTurns8(Min8(Load8(v), Set8(1.0f)), sine, cosine);
-      const F8 r = Sqrt8(sin2);
       const size_t at = size_t{j} * stride_ + k;
-      Store8(x + at, r * cosine);
-      Store8(y + at, r * sine);
-      Store8(z + at, Sqrt8(Max8(Set8(1.0f) - sin2, Set8(0.0f))));
+      StoreDirections8(Load8(u), Load8(v), x + at, y + at, z + at);
       for (uint32_t i = 0; i < 8; ++i) {
         if (k + i >= sectors_) x[at + i] = y[at + i] = z[at + i] = 0.0f;
       }
     }
+  }
+}
+
+void HemisphereGrid::DirectionsIn(uint32_t ring, uint32_t sector, uint64_t key, uint32_t first,
+                                  uint32_t count, float* x, float* y, float* z) const {
+  // 2^32 / g and 2^32 / g², g the real root of g³ = g + 1.
+  constexpr uint32_t kStepU = 3242174889u, kStepV = 2447445414u;
+  const float inverse_rings = 1.0f / static_cast<float>(rings_);
+  const float inverse_sectors = 1.0f / static_cast<float>(sectors_);
+  const uint64_t random = HashKey(key, ring * stride_ + sector);
+  alignas(32) float u[8], v[8];
+  for (uint32_t at = 0; at < count; at += 8) {
+    for (uint32_t i = 0; i < 8; ++i) {
+      const uint32_t index = first + at + i;
+      u[i] =
+          (static_cast<float>(ring) + ToUnitFloat(static_cast<uint32_t>(random) + index * kStepU)) *
+          inverse_rings;
+      v[i] = (static_cast<float>(sector) +
+              ToUnitFloat(static_cast<uint32_t>(random >> 32) + index * kStepV)) *
+             inverse_sectors;
+    }
+    StoreDirections8(Load8(u), Load8(v), x + at, y + at, z + at);
   }
 }
 

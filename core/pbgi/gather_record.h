@@ -40,6 +40,12 @@ class HemisphereGrid {
   // One direction in each stratum, jittered by `key`, as three arrays of padded() elements;
   // what lies beyond sectors() is zero. pdf_sr over all strata: cos θ / pi.
   void Directions(uint64_t key, float* x, float* y, float* z) const;
+  // More of one stratum: directions `first` to `first + count - 1` of the sequence whose 0th is the
+  // one of Directions(key), an additive recurrence in two dimensions (Roberts 2018, R2), so that
+  // any number of them covers the stratum evenly and each alone is uniform. Writes up to the next
+  // multiple of eight.
+  void DirectionsIn(uint32_t ring, uint32_t sector, uint64_t key, uint32_t first, uint32_t count,
+                    float* x, float* y, float* z) const;
   // The middles of the strata instead.
   void Centres(float* x, float* y, float* z) const;
 
@@ -59,7 +65,8 @@ class HemisphereSamples {
   const float* direction(int axis) const { return values_[axis]; }
   float* radiance(int channel) { return values_[3 + channel]; }  // W/(m² sr)
   const float* radiance(int channel) const { return values_[3 + channel]; }
-  // 1/m; 0: nothing there; negative: not seen, since it lies below the surface (radiance 0).
+  // 1/m, the mean where a stratum has several; 0: nothing there; negative: not seen, since it lies
+  // below the surface (radiance 0).
   float* inverse_distance() { return values_[6]; }
   const float* inverse_distance() const { return values_[6]; }
 

@@ -25,7 +25,7 @@ struct alignas(32) Lanes {
 
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight) {
+                  std::span<float> weight, std::span<std::array<float, 8>> shares) {
   Lanes lanes;
   const size_t count = receivers.size();
   for (size_t i = 0; i < 8; ++i) {
@@ -43,11 +43,19 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
   const F8 nx = Load8(lanes.nx), ny = Load8(lanes.ny), nz = Load8(lanes.nz);
   const F8 px = Load8(lanes.px), py = Load8(lanes.py);
   const F8 zero = Set8(0.0f), one = Set8(1.0f);
-  F8 sum[3] = {zero, zero, zero}, weights = zero;
-  for (const ScreenRecord* record : records) {
-    const GatherRecord& g = record->gather;
-    const F8 du = px - Set8(record->x_px), dv = py - Set8(record->y_px);
-    const float inverse_screen = 1.0f / (record->screen_reach_px * record->screen_reach_px);
+
+  // What reaches the receivers, and the finest scale that it tells of.
+  struct Term {
+    F8 away, rest, screen;  // the first two of w's subtrahends, the third, and the second factor
+    size_t record;
+  };
+  thread_local AlignedVector<Term> terms;
+  terms.clear();
+  F8 finest = zero;
+  for (size_t k = 0; k < records.size(); ++k) {
+    const GatherRecord& g = records[k]->gather;
+    const F8 du = px - Set8(records[k]->x_px), dv = py - Set8(records[k]->y_px);
+    const float inverse_screen = 1.0f / (records[k]->screen_reach_px * records[k]->screen_reach_px);
     const F8 screen = one - (du * du + dv * dv) * Set8(inverse_screen);
     if (Bits8(screen > zero) == 0) continue;
     const F8 dx = x - Set8(g.position.x), dy = y - Set8(g.position.y), dz = z - Set8(g.position.z);
@@ -59,10 +67,25 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     const F8 off = Abs8(dx * (nx + Set8(g.normal.x)) + dy * (ny + Set8(g.normal.y)) +
                         dz * (nz + Set8(g.normal.z)));
     const F8 inverse_reach = Set8(1.0f / g.reach_m);
-    F8 w = one - (distance + off) * inverse_reach - turned;
-    const M8 in = (w > zero) & (screen > zero);
+    const F8 away = distance + off;
+    const F8 w = one - away * inverse_reach - turned;
+    if (Bits8((w > zero) & (screen > zero)) == 0) continue;
+    finest = Max8(finest, Max8(w, zero) * Max8(screen, zero) * inverse_reach);
+    terms.push_back({away, one - turned, screen, k});
+  }
+
+  for (auto& share : shares) share.fill(0.0f);
+  F8 sum[3] = {zero, zero, zero}, weights = zero;
+  for (const Term& term : terms) {
+    const GatherRecord& g = records[term.record]->gather;
+    F8 w = term.rest - term.away * Max8(Set8(1.0f / g.reach_m), finest);
+    const M8 in = (w > zero) & (term.screen > zero);
     if (Bits8(in) == 0) continue;
-    w = Select8(in, w * w * screen * screen, zero);
+    w = Select8(in, w * w * term.screen * term.screen, zero);
+    if (!shares.empty()) {
+      for (size_t i = 0; i < 8; ++i) shares[term.record][i] = w[i];
+    }
+    const F8 dx = x - Set8(g.position.x), dy = y - Set8(g.position.y), dz = z - Set8(g.position.z);
     const F8 tx = nx - Set8(g.normal.x), ty = ny - Set8(g.normal.y), tz = nz - Set8(g.normal.z);
     weights += w;
     for (int c = 0; c < 3; ++c) {
@@ -242,7 +265,10 @@ void ReceiverHierarchy::SetReach(float footprint_m, float most_reach_m,
     if (slope > 0.0f) reach = std::min(reach, 0.5f * g.irradiance[c] / slope);
   }
   reach = std::min(reach, most_reach_m);
-  const float floor = params_.floor_px * footprint_m;
+  // Where something is nearer than the floor, a floor that high would carry the dark of a crevice
+  // out of it.
+  const float floor =
+      std::min(params_.floor_px * footprint_m, std::max(footprint_m, g.harmonic_distance_m));
   if (!(reach >= floor)) {
     const float scale = floor > 0.0f ? std::max(reach, 0.0f) / floor : 0.0f;
     for (Vec3f& slope : g.gradient) slope *= scale;

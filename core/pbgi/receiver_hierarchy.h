@@ -11,14 +11,19 @@
 // receiver at a pixel's centre is served.
 //
 // The weight of record k at a receiver x with normal n, at point p of the image:
-//   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / a - sqrt((1 - n·n_c) / kNormalTolerance))²
+//   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / min(a, b) - sqrt((1 - n·n_c) /
+//   kNormalTolerance))²
 //       · max(0, 1 - |p - p_c|² / ρ²)²,   ρ = kScreenReach s_l,
 // continuous and of compact support in all of its arguments. The reach a is `reach` times the
 // harmonic mean distance of what the record saw, at most E / (2 |∇E|), at most a coarser
-// neighbour's reach plus the distance to it, at least `floor_px` pixels' footprints (then the
-// gradient is reduced in proportion).
+// neighbour's reach plus the distance to it, at least `floor_px` pixels' footprints or, where that
+// is less, the harmonic distance, or one footprint (then the gradient is reduced in proportion).
+// The bound b keeps a record of the open from weighing where others, that came after it, tell of
+// something near (the neighbour clamping of Křivánek et al. 2006, the other way round): of all
+// records j that weigh at x, 1/b = max_j sqrt(w_j)/a_j, with b = ∞ in w_j.
 #pragma once
 
+#include <array>
 #include <atomic>
 #include <cstdint>
 #include <functional>
@@ -41,11 +46,11 @@ inline constexpr float kNormalTolerance = 0.3f;  // 1 - cos of the angle at whic
 struct HierarchyParams {
   uint32_t coarsest_px = 16;         // spacing of level 0; a power of two
   uint32_t coarsest_samples = 1024;  // strata of a record of level 0; those of level l are
-  float fall_off = 0.5f;             // (s_l / s_0)^fall_off times as many, at least
+  float fall_off = 0.35f;            // (s_l / s_0)^fall_off times as many, at least
   uint32_t least_samples = 64;
-  float reach = 0.15f;  // a over the harmonic mean distance
-  float enough = 0.2f;  // summed weight that spares a receiver a record of its own
-  float floor_px = 4;   // least a, in pixels' footprints
+  float reach = 0.15f;   // a over the harmonic mean distance
+  float enough = 0.25f;  // summed weight that spares a receiver a record of its own
+  float floor_px = 4;    // least a, in pixels' footprints, see above
   uint64_t seed = 0;
 };
 
@@ -75,10 +80,10 @@ struct ServedReceiver {
 
 // Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs. What a
 // receiver gets depends on the records that weigh on it and on their order, not on the other
-// receivers.
+// receivers. `shares`: none, or for each record its w at each receiver.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight);
+                  std::span<float> weight, std::span<std::array<float, 8>> shares = {});
 
 class ReceiverHierarchy {
  public:

@@ -84,6 +84,7 @@ HierarchyParams HierarchyOf(const RenderSettings& settings) {
   switch (settings.quality) {
     case Quality::kDraft:
       p.coarsest_samples = 512;
+      p.fall_off = 0.5f;
       p.reach = 0.25f;
       p.enough = 0.1f;
       p.floor_px = 6;
@@ -97,6 +98,19 @@ HierarchyParams HierarchyOf(const RenderSettings& settings) {
       break;
   }
   return p;
+}
+
+// Standard deviation that a stratum of a record may leave, in parts of the frame's mean irradiance.
+float NoiseOf(const RenderSettings& settings) {
+  switch (settings.quality) {
+    case Quality::kDraft:
+      return 0.02f;
+    case Quality::kNormal:
+      break;
+    case Quality::kFine:
+      return 0.002f;
+  }
+  return 0.003f;
 }
 
 IrradianceCacheParams CacheOf(const RenderSettings& settings) {
@@ -173,6 +187,11 @@ class Renderer final : public FrameRenderer {
     if (NeedsHierarchy()) {
       const double cpu = ProcessCpuSeconds();
       ReceiverHierarchy::Counts counts;
+      std::call_once(refined_, [&] {
+        if (settings_.fill_in_force() == Fill::kRays) {
+          gatherer_->Refine(NoiseOf(settings_), frame_.film.frame(), executor);
+        }
+      });
       view = hierarchy_->Prepare(tile, executor, go_on, counts);
       Stats stats = gatherer_->TakeStats();
       if (!view) return absl::CancelledError("the tile was cancelled");
@@ -464,6 +483,7 @@ class Renderer final : public FrameRenderer {
           .push_back(r);
     }
     std::vector<const ScreenRecord*> records;
+    std::vector<std::array<float, 8>> shares;  // of the records, if they are asked for
     for (size_t g = 0; g < groups.size(); ++g) {
       if (groups[g].empty()) continue;
       const int x0 = block.x0 + static_cast<int>(g) % kAcross * kSide;
@@ -481,22 +501,21 @@ class Renderer final : public FrameRenderer {
           served[i] = {&receivers[r], static_cast<float>(block.x0 + pixel % block.width()) + 0.5f,
                        static_cast<float>(block.y0 + pixel / block.width()) + 0.5f};
         }
-        BlendRecords(records, {served, count}, {e, count}, {weight, count});
+        if (wants_cluster_) shares.resize(records.size());
+        BlendRecords(records, {served, count}, {e, count}, {weight, count}, shares);
         for (size_t i = 0; i < count; ++i) {
           Sample& sample = samples[sample_of[groups[g][at + i]]];
           sample.indirect_e = e[i];
           sample.weight = weight[i];
           if (!wants_cluster_) continue;
-          for (const ScreenRecord* record : records) {
-            Rgb alone;
-            float share;
-            BlendRecords({&record, 1}, {&served[i], 1}, {&alone, 1}, {&share, 1});
+          for (size_t k = 0; k < records.size(); ++k) {
+            const float share = shares[k][i];
             if (!(share > 0.0f)) continue;
             ++sample.cut_size;
             if (share > sample.heaviest) {
               sample.heaviest = share;
-              sample.cluster = (record->y_px - 0.5f) * static_cast<float>(frame_.film.width) +
-                               (record->x_px - 0.5f);
+              sample.cluster = (records[k]->y_px - 0.5f) * static_cast<float>(frame_.film.width) +
+                               (records[k]->x_px - 0.5f);
             }
           }
         }
@@ -793,6 +812,7 @@ class Renderer final : public FrameRenderer {
   HemisphereGrid ray_grid_;  // of k clusters per block filled by rays
   CutParams cut_params_;
   std::unique_ptr<RecordGatherer> gatherer_;
+  mutable std::once_flag refined_;                // on the first tile that needs it
   std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
   mutable std::mutex cache_mutex_;
   mutable std::unique_ptr<const IrradianceCache> cache_;  // irrcache

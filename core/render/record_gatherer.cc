@@ -13,7 +13,108 @@ namespace {
 
 // Below this many surfel spacings from the receiver a hit is shaded afresh.
 constexpr float kNearSpacings = 2.0f;
-enum : uint64_t { kKeyDirections = 31, kKeyLight = 32 };
+// Of a stratum, beyond its first. A multiple of eight.
+constexpr uint32_t kMostExtraRays = 32;
+// The receivers that say how bright a frame is: one for so many pixels, within bounds.
+constexpr int kPixelsPerPilot = 256, kLeastPilots = 16, kMostPilots = 256;
+constexpr uint32_t kPilotSamples = 128;
+enum : uint64_t { kKeyDirections = 31, kKeyLight = 32, kKeyPilot = 33, kKeyPilotGather = 34 };
+
+// What one receiver sees along rays.
+class HitReader {
+ public:
+  HitReader(const LoadedSceneData& scene, const SurfelAtlas* atlas, float near_m,
+            const Receiver& receiver, uint64_t light_key)
+      : scene_(scene),
+        atlas_(atlas),
+        near_m_(near_m),
+        origin_(scene.accel->LeaveSurface(receiver.position, receiver.geometric_normal)),
+        light_key_(light_key) {}
+
+  // The reflected radiance that arrives along -w and 1 / the distance, 0: nothing there.
+  // `index` tells the ray from the others.
+  Rgb Read(const Vec3f& w, uint32_t index, float& inverse_distance) {
+    const PreparedScene& scene = *scene_.scene;
+    ++rays;
+    inverse_distance = 0;
+    const std::optional<RayHit> hit = scene_.accel->Intersect(origin_, w);
+    if (!hit) return {};
+    // A hit at the origin itself has no distance: as near as the offset that the ray took.
+    const float t = std::max(hit->t, scene_.accel->surface_offset_m());
+    inverse_distance = 1.0f / t;
+    Vec3f ng = scene.GeometricNormal(hit->triangle);
+    const bool front = !(Dot(ng, w) > 0.0f);
+    if (!front) ng = -ng;
+    if (atlas_ != nullptr && t > near_m_) {
+      const std::optional<Rgb> radiance = atlas_->Radiance(hit->triangle, hit->b1, hit->b2, front);
+      if (radiance) {
+        ++read;
+        return *radiance;
+      }
+    }
+    const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
+    if (!(MaxComponent(surface.albedo) > 0.0f)) return {};
+    ++shaded;
+    Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
+    if (!front) ns = -ns;
+    const Vec3f y = scene.PointOn(hit->triangle, hit->b1, hit->b2);
+    const Rgb e = scene_.lights->Irradiance(y, ng, ns, 1, light_key_, index, 2, counters);
+    return surface.albedo * e * kInvPif;
+  }
+
+  LightCounters counters;
+  uint64_t rays = 0, read = 0, shaded = 0;
+
+ private:
+  const LoadedSceneData& scene_;
+  const SurfelAtlas* const atlas_;
+  const float near_m_;
+  const Vec3f origin_;
+  const uint64_t light_key_;
+};
+
+// How many more rays each stratum deserves, an array of grid.padded() elements: the standard
+// deviation among its up to eight neighbours times its solid angle, over `least_share`.
+std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSamples& samples,
+                               float least_share) {
+  const uint32_t rings = grid.rings(), sectors = grid.sectors(), stride = grid.stride();
+  const float scale = kPif / static_cast<float>(grid.size()) / least_share;
+  // Sums of columns of three rings, and of their squares, of the mean of the channels; the first
+  // and the last sector stand again at the other end.
+  std::vector<float> value(grid.padded());
+  for (size_t at = 0; at < value.size(); ++at) {
+    value[at] =
+        (samples.radiance(0)[at] + samples.radiance(1)[at] + samples.radiance(2)[at]) * (1.0f / 3);
+  }
+  std::vector<uint8_t> extra(grid.padded(), 0);
+  std::vector<float> sum(sectors + 2), squares(sectors + 2);
+  for (uint32_t j = 0; j < rings; ++j) {
+    const uint32_t first = j > 0 ? j - 1 : 0, last = std::min(j + 1, rings - 1);
+    for (uint32_t k = 0; k < sectors; ++k) {
+      float s = 0, q = 0;
+      for (uint32_t i = first; i <= last; ++i) {
+        const float l = value[size_t{i} * stride + k];
+        s += l;
+        q += l * l;
+      }
+      sum[k + 1] = s;
+      squares[k + 1] = q;
+    }
+    sum[0] = sum[sectors], squares[0] = squares[sectors];
+    sum[sectors + 1] = sum[1], squares[sectors + 1] = squares[1];
+    const float inverse = 1.0f / static_cast<float>(3 * (last - first + 1) - 1);
+    for (uint32_t k = 0; k < sectors; ++k) {
+      const size_t at = size_t{j} * stride + k;
+      if (samples.inverse_distance()[at] < 0) continue;
+      const float own = value[at];
+      const float mean = (sum[k] + sum[k + 1] + sum[k + 2] - own) * inverse;
+      const float square = (squares[k] + squares[k + 1] + squares[k + 2] - own * own) * inverse;
+      const float rays = scale * std::sqrt(std::max(0.0f, square - mean * mean));
+      extra[at] = static_cast<uint8_t>(std::min(rays, static_cast<float>(kMostExtraRays)));
+    }
+  }
+  return extra;
+}
 
 }  // namespace
 
@@ -56,18 +157,48 @@ GatherRecord RecordGatherer::Gather(const Receiver& receiver, const HemisphereGr
                                                  : GatherByRays(receiver, grid, key);
 }
 
+void RecordGatherer::Refine(float noise, const PixelRect& frame, Executor& executor) {
+  least_share_ = 0;
+  if (!(noise > 0) || frame.empty()) return;
+  const int pilots = static_cast<int>(
+      std::clamp<int64_t>(frame.area() / kPixelsPerPilot, kLeastPilots, kMostPilots));
+  const int side =
+      std::max(1, static_cast<int>(std::sqrt(static_cast<double>(frame.area()) / pilots)));
+  const int columns = (frame.width() + side - 1) / side;
+  const int rows = (frame.height() + side - 1) / side;
+  const HemisphereGrid grid(kPilotSamples);
+  std::vector<double> seen(static_cast<size_t>(columns) * static_cast<size_t>(rows), -1.0);
+  executor.ForEach(seen.size(), 1, [&](size_t i) {
+    const uint64_t jitter = HashKey(settings_.seed, kKeyPilot, i);
+    const auto within = [&](uint64_t random) {
+      return static_cast<int>(random % static_cast<uint64_t>(side));
+    };
+    const int x = frame.x0 + static_cast<int>(i) % columns * side + within(jitter & 0xffffffffu);
+    const int y = frame.y0 + static_cast<int>(i) / columns * side + within(jitter >> 32);
+    Receiver receiver;
+    float footprint_m;
+    if (!frame.Contains(x, y) || !ReceiverAt(x, y, receiver, footprint_m)) return;
+    const Rgb e = Gather(receiver, grid, HashKey(settings_.seed, kKeyPilotGather, i)).irradiance;
+    seen[i] = (static_cast<double>(e.x) + static_cast<double>(e.y) + static_cast<double>(e.z)) / 3;
+  });
+  double sum = 0;
+  int count = 0;
+  for (const double e : seen) {
+    if (!(e >= 0)) continue;
+    sum += e;
+    ++count;
+  }
+  if (count > 0) least_share_ = static_cast<float>(sum / count) * noise;
+}
+
 GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const HemisphereGrid& grid,
                                           uint64_t key) const {
   const double start = ThreadCpuSeconds();
-  const PreparedScene& scene = *scene_.scene;
-  const RayAccel& accel = *scene_.accel;
   const Frame frame(receiver.normal);
-  const Vec3f origin = accel.LeaveSurface(receiver.position, receiver.geometric_normal);
   HemisphereSamples samples(grid);
-  grid.Directions(HashKey(key, kKeyDirections), samples.direction(0), samples.direction(1),
-                  samples.direction(2));
-  LightCounters counters;
-  uint64_t rays = 0, read = 0, shaded = 0;
+  const uint64_t directions_key = HashKey(key, kKeyDirections);
+  grid.Directions(directions_key, samples.direction(0), samples.direction(1), samples.direction(2));
+  HitReader reader(scene_, atlas_, near_m_, receiver, HashKey(key, kKeyLight));
   for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
     for (uint32_t sector = 0; sector < grid.sectors(); ++sector) {
       const size_t at = size_t{ring} * grid.stride() + sector;
@@ -78,42 +209,45 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
         samples.inverse_distance()[at] = -1;
         continue;
       }
-      ++rays;
-      const std::optional<RayHit> hit = accel.Intersect(origin, w);
-      if (!hit) continue;
-      // A hit at the origin itself has no distance: as near as the offset that the ray took.
-      const float t = std::max(hit->t, accel.surface_offset_m());
-      samples.inverse_distance()[at] = 1.0f / t;
-      Vec3f ng = scene.GeometricNormal(hit->triangle);
-      const bool front = !(Dot(ng, w) > 0.0f);
-      if (!front) ng = -ng;
-      std::optional<Rgb> radiance;
-      if (atlas_ != nullptr && t > near_m_) {
-        radiance = atlas_->Radiance(hit->triangle, hit->b1, hit->b2, front);
+      const Rgb radiance =
+          reader.Read(w, static_cast<uint32_t>(at), samples.inverse_distance()[at]);
+      for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = radiance[c];
+    }
+  }
+  uint64_t refined = 0;
+  if (least_share_ > 0) {
+    const std::vector<uint8_t> extra = ExtraRays(grid, samples, least_share_);
+    alignas(32) float x[kMostExtraRays], y[kMostExtraRays], z[kMostExtraRays];
+    for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
+      for (uint32_t sector = 0; sector < grid.sectors(); ++sector) {
+        const size_t at = size_t{ring} * grid.stride() + sector;
+        if (extra[at] == 0) continue;
+        ++refined;
+        grid.DirectionsIn(ring, sector, directions_key, 1, extra[at], x, y, z);
+        Rgb sum(samples.radiance(0)[at], samples.radiance(1)[at], samples.radiance(2)[at]);
+        float inverse_sum = samples.inverse_distance()[at];
+        for (uint32_t i = 0; i < extra[at]; ++i) {
+          const Vec3f w = frame.ToWorld({x[i], y[i], z[i]});
+          if (!(Dot(w, receiver.geometric_normal) > 0.0f)) continue;
+          float inverse;
+          sum += reader.Read(w, static_cast<uint32_t>((i + 1) * grid.padded() + at), inverse);
+          inverse_sum += inverse;
+        }
+        const float share = 1.0f / static_cast<float>(extra[at] + 1);
+        for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = sum[c] * share;
+        samples.inverse_distance()[at] = inverse_sum * share;
       }
-      if (radiance) {
-        ++read;
-      } else {
-        const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
-        if (!(MaxComponent(surface.albedo) > 0.0f)) continue;
-        ++shaded;
-        Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
-        if (!front) ns = -ns;
-        const Vec3f y = scene.PointOn(hit->triangle, hit->b1, hit->b2);
-        const Rgb e = scene_.lights->Irradiance(y, ng, ns, 1, HashKey(key, kKeyLight),
-                                                static_cast<uint32_t>(at), 2, counters);
-        radiance = surface.albedo * e * kInvPif;
-      }
-      for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = (*radiance)[c];
     }
   }
   const GatherRecord record = MakeGatherRecord(grid, samples, receiver.position, frame);
   const std::lock_guard lock(mutex_);
   stats_.seconds[static_cast<int>(Stage::kTrace)] += ThreadCpuSeconds() - start;
-  stats_.counts["rays"] += rays + counters.rays;
-  stats_.counts["hits_shaded"] += shaded;
-  stats_.skipped["hits_read_from_surfels"] += read;
-  stats_.skipped["shadow_rays"] += counters.skipped_facing_away;
+  stats_.counts["rays"] += reader.rays + reader.counters.rays;
+  stats_.counts["gather_rays"] += reader.rays;
+  stats_.counts["strata_refined"] += refined;
+  stats_.counts["hits_shaded"] += reader.shaded;
+  stats_.skipped["hits_read_from_surfels"] += reader.read;
+  stats_.skipped["shadow_rays"] += reader.counters.skipped_facing_away;
   return record;
 }
 

@@ -2,7 +2,9 @@
 #pragma once
 
 #include <memory>
+#include <mutex>
 
+#include "core/base/executor.h"
 #include "core/base/stats.h"
 #include "core/pbgi/microbuffer_map.h"
 #include "core/pbgi/receiver_hierarchy.h"
@@ -25,6 +27,11 @@ class RecordGatherer final : public RecordSource {
                  const RenderSettings& settings, const MicrobufferMap& map,
                  const CutParams& cut_params);
 
+  // From now on strata are refined: `noise` times the mean irradiance (of the three channels) at a
+  // few hundred receivers of `frame`, which are gathered here; 0, or nothing seen, is none. Not to
+  // be called while others gather.
+  void Refine(float noise, const PixelRect& frame, Executor& executor);
+
   bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
   GatherRecord Gather(const Receiver& receiver, const HemisphereGrid& grid,
                       uint64_t key) const override;
@@ -43,6 +50,7 @@ class RecordGatherer final : public RecordSource {
   const MicrobufferMap& map_;
   const CutParams& cut_params_;
   const SurfelAtlas* atlas_ = nullptr;  // null: shade every hit
+  float least_share_ = 0;               // of standard deviation, W/m², for a ray more; 0: none
   float near_m_ = 0;                    // hits nearer than this are shaded afresh
   mutable std::mutex mutex_;
   mutable Stats stats_;

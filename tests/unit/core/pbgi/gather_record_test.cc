@@ -83,6 +83,40 @@ TEST(HemisphereGrid, DirectionsLieInTheirStrata) {
   }
 }
 
+TEST(HemisphereGrid, MoreDirectionsOfAStratumCoverItEvenly) {
+  const HemisphereGrid grid(363);
+  AlignedVector<float> x0(grid.padded()), y0(grid.padded()), z0(grid.padded());
+  grid.Directions(9, x0.data(), y0.data(), z0.data());
+  for (const uint32_t ring : {0u, 4u, grid.rings() - 1}) {
+    for (const uint32_t sector : {0u, 17u, grid.sectors() - 1}) {
+      constexpr uint32_t kCount = 64;
+      alignas(32) float x[kCount], y[kCount], z[kCount];
+      grid.DirectionsIn(ring, sector, 9, 0, kCount, x, y, z);
+      const size_t at = size_t{ring} * grid.stride() + sector;
+      EXPECT_EQ(x[0], x0[at]);
+      EXPECT_EQ(y[0], y0[at]);
+      EXPECT_EQ(z[0], z0[at]);
+      alignas(32) float later[3][8];
+      grid.DirectionsIn(ring, sector, 9, 40, 3, later[0], later[1], later[2]);
+      EXPECT_EQ(later[0][2], x[42]);
+      // A quarter of them, give or take two, in each quarter of the stratum.
+      int quarters[4] = {};
+      for (uint32_t i = 0; i < kCount; ++i) {
+        const double sin2 = x[i] * x[i] + y[i] * y[i];
+        double phi = std::atan2(static_cast<double>(y[i]), static_cast<double>(x[i]));
+        if (phi < 0) phi += 2 * M_PI;
+        const double u = sin2 * grid.rings() - ring, v = phi / (2 * M_PI) * grid.sectors() - sector;
+        EXPECT_GT(u, -1e-3);
+        EXPECT_LT(u, 1 + 1e-3);
+        EXPECT_GT(v, -1e-2);
+        EXPECT_LT(v, 1 + 1e-2);
+        ++quarters[(u > 0.5 ? 1 : 0) + (v > 0.5 ? 2 : 0)];
+      }
+      for (const int n : quarters) EXPECT_NEAR(n, 16, 3) << ring << " " << sector;
+    }
+  }
+}
+
 TEST(GatherRecord, EqualsTheLiteralSums) {
   for (const uint32_t samples : {1u, 16u, 64u, 250u, 1024u}) {
     const HemisphereGrid grid(samples);

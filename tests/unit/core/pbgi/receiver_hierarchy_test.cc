@@ -99,7 +99,8 @@ TEST(ReceiverHierarchy, EveryPixelIsServedAndALinearFieldIsReproduced) {
       Rgb e;
       float weight;
       BlendRecords(records, {&served, 1}, {&e, 1}, {&weight, 1});
-      EXPECT_GE(weight, hierarchy.params().enough) << x << " " << y;
+      // A record that came later may have taken some of the others' weight, but never its own.
+      EXPECT_GE(weight, 0.5f * hierarchy.params().enough) << x << " " << y;
       EXPECT_NEAR(e.x, Floor::Irradiance(r), 2e-5f) << x << " " << y;
       EXPECT_NEAR(e.y, 2 * Floor::Irradiance(r), 4e-5f) << x << " " << y;
     }
@@ -144,26 +145,39 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
   }
   std::vector<Rgb> e(8);
   std::vector<float> weight(8);
-  BlendRecords(list, served, e, weight);
+  std::vector<std::array<float, 8>> shares(list.size());
+  BlendRecords(list, served, e, weight, shares);
   for (size_t i = 0; i < 8; ++i) {
     Vec3d sum;
-    double weights = 0;
+    double weights = 0, finest = 0, scale = 0;
     const Receiver& x = receivers[i];
-    for (const ScreenRecord& r : records) {
-      const double du = static_cast<double>(served[i].x_px - r.x_px);
-      const double dv = static_cast<double>(served[i].y_px - r.y_px);
-      const double screen = 1 - (du * du + dv * dv) / (static_cast<double>(r.screen_reach_px) *
-                                                       static_cast<double>(r.screen_reach_px));
-      const Vec3d d = Vec3d(x.position) - Vec3d(r.gather.position);
-      const double off = std::fabs(Dot(d, Vec3d(x.normal) + Vec3d(r.gather.normal)));
-      const double turned =
-          std::sqrt(std::max(0.0, 1 - Dot(Vec3d(x.normal), Vec3d(r.gather.normal))) /
-                    static_cast<double>(kNormalTolerance));
-      const double w = 1 - (Length(d) + off) / static_cast<double>(r.gather.reach_m) - turned;
-      if (!(w > 0) || !(screen > 0)) continue;
-      const double share = w * w * screen * screen;
-      weights += share;
-      sum += Vec3d(IrradianceAt(r.gather, x.position, x.normal)) * share;
+    // Of all records first the finest scale that they tell of, then the weights that it leaves.
+    for (const bool weighs : {false, true}) {
+      for (size_t k = 0; k < records.size(); ++k) {
+        const ScreenRecord& r = records[k];
+        const double du = static_cast<double>(served[i].x_px - r.x_px);
+        const double dv = static_cast<double>(served[i].y_px - r.y_px);
+        const double screen = 1 - (du * du + dv * dv) / (static_cast<double>(r.screen_reach_px) *
+                                                         static_cast<double>(r.screen_reach_px));
+        const Vec3d d = Vec3d(x.position) - Vec3d(r.gather.position);
+        const double off = std::fabs(Dot(d, Vec3d(x.normal) + Vec3d(r.gather.normal)));
+        const double turned =
+            std::sqrt(std::max(0.0, 1 - Dot(Vec3d(x.normal), Vec3d(r.gather.normal))) /
+                      static_cast<double>(kNormalTolerance));
+        const double inverse = std::max(1 / static_cast<double>(r.gather.reach_m), finest);
+        const double w = 1 - (Length(d) + off) * inverse - turned;
+        if (weighs) {
+          EXPECT_NEAR(shares[k][i], w > 0 && screen > 0 ? w * w * screen * screen : 0, 1e-5);
+        }
+        if (!(w > 0) || !(screen > 0)) continue;
+        if (weighs) {
+          weights += w * w * screen * screen;
+          sum += Vec3d(IrradianceAt(r.gather, x.position, x.normal)) * (w * w * screen * screen);
+        } else {
+          scale = std::max(scale, w * screen * inverse);
+        }
+      }
+      finest = scale;
     }
     ASSERT_GT(weights, 0) << i;
     EXPECT_NEAR(weight[i], weights, 1e-4 * weights) << i;
@@ -175,6 +189,43 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
     BlendRecords(list, {&served[i], 1}, {&alone, 1}, {&alone_weight, 1});
     EXPECT_EQ(alone, e[i]);
     EXPECT_EQ(alone_weight, weight[i]);
+  }
+}
+
+// A record of the open, coarse and far-reaching, beside one that tells of something near.
+TEST(ReceiverHierarchy, ARecordOfTheOpenDoesNotReachIntoACorner) {
+  ScreenRecord open, corner;
+  open.x_px = 20;
+  open.screen_reach_px = 24;
+  open.gather.position = {20, 0, 0};
+  open.gather.normal = {0, 0, 1};
+  open.gather.reach_m = 60;
+  open.gather.irradiance = {1, 1, 1};
+  corner.screen_reach_px = 3;
+  corner.gather.normal = {0, 0, 1};
+  corner.gather.reach_m = 4;
+  corner.gather.irradiance = {0.01f, 0.01f, 0.01f};
+  const ScreenRecord* list[] = {&open, &corner};
+  const auto at = [&](float px) {
+    Receiver r;
+    r.position = {px, 0, 0};
+    r.normal = {0, 0, 1};
+    const ServedReceiver served{&r, px, 0};
+    Rgb e;
+    float weight;
+    BlendRecords(list, {&served, 1}, {&e, 1}, {&weight, 1});
+    return e.x;
+  };
+  EXPECT_FLOAT_EQ(at(0), 0.01f);
+  EXPECT_FLOAT_EQ(at(1), 0.01f);
+  EXPECT_FLOAT_EQ(at(10), 1.0f);
+  // Continuous on the way out.
+  float before = at(0);
+  for (float px = 0; px <= 10; px += 0.01f) {
+    const float e = at(px);
+    EXPECT_NEAR(e, before, 0.05f) << px;
+    EXPECT_GE(e, before - 1e-5f) << px;
+    before = e;
   }
 }
 
