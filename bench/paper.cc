@@ -31,11 +31,12 @@ namespace {
 
 constexpr std::array kGatherStages = {Stage::kCluster,   Stage::kCut,      Stage::kRaster,
                                       Stage::kComposite, Stage::kConvolve, Stage::kTrace};
-constexpr int kSampleSide = 8;                // pixels of a sampled block
-constexpr int kCellSide = 4;                  // pixels of a cell with one pixel of the reference
-constexpr float kDifferenceScale = 16;        // of difference images
-constexpr double kWhiteQuantile = 0.99;       // of the indirect layer, as CompareOptions has it
-constexpr double kFrameWhiteQuantile = 0.98;  // of renders that are only looked at
+constexpr int kSampleSide = 8;           // pixels of a sampled block
+constexpr int kCellSide = 4;             // pixels of a cell with one pixel of the reference
+constexpr float kDifferenceScale = 16;   // of difference images
+constexpr double kWhiteQuantile = 0.99;  // of the indirect layer, as CompareOptions has it
+// Of renders that are only looked at: the lesser of a quantile and so many times the median.
+constexpr double kFrameWhiteQuantile = 0.98, kFrameWhiteMedians = 6;
 constexpr double kReferenceNoise = 0.01;
 // Any other number would do: the reference's paths must not be those of a render.
 constexpr uint64_t kReferenceSeedOffset = 0x9e3779b97f4a7c15ull;
@@ -112,7 +113,7 @@ Rgb ValueAt(const Film& film, Layer layer, int x, int y) {
   return {film.Get(layer, 0, x, y), film.Get(layer, 1, x, y), film.Get(layer, 2, x, y)};
 }
 
-// The q-quantile of what is positive; 0 if nothing is.
+// The q-quantile; 0 of nothing.
 double Quantile(std::vector<float> values, double q) {
   if (values.empty()) return 0;
   const auto at =
@@ -521,7 +522,9 @@ class SceneRun {
         luminance.push_back(Luminance(ValueAt(fpbgi_, Layer::kBeauty, x, y)));
       }
     }
-    const double white = Quantile(std::move(luminance), kFrameWhiteQuantile);
+    double white = Quantile(luminance, kFrameWhiteQuantile);
+    const double median = Quantile(std::move(luminance), 0.5);
+    if (median > 0) white = std::min(white, kFrameWhiteMedians * median);
     report_.pictures.push_back(
         PictureOf(Displayed(fpbgi_, Layer::kBeauty, frame_rect_, white > 0 ? white : 1.0),
                   "fpbgi-frame", "fpbgi, the whole frame, direct and indirect light"));
