@@ -13,7 +13,8 @@ namespace {
 constexpr unsigned kCityBlocks = 4, kSmallCityBlocks = 2;
 constexpr uint64_t kCitySeed = 1;
 
-absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small, bool light_chosen) {
+absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small,
+                                const SceneChanges& changes) {
   if (name_or_path == "cornell") return BenchScene{MakeCornellBox(), {}};
   if (name_or_path == "furnace") return BenchScene{MakeFurnace(0.5f, 1.0f), {}};
   if (name_or_path == "city") {
@@ -21,7 +22,9 @@ absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small, boo
   }
   FP_ASSIGN_OR_RETURN(const AssetBundle asset, CollectAsset(name_or_path));
   FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, ImportOptions()));
-  EnsureCameraAndLight(imported, light_chosen);
+  // One that is chosen need not be made up.
+  if (changes.view && imported.scene.cameras.empty()) imported.scene.cameras.resize(1);
+  EnsureCameraAndLight(imported, changes.sun.has_value() || changes.sky.has_value());
   return BenchScene{std::move(imported.scene), std::move(imported.notes)};
 }
 
@@ -29,8 +32,7 @@ absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small, boo
 
 absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small,
                                           const SceneChanges& changes) {
-  FP_ASSIGN_OR_RETURN(BenchScene made, Load(name_or_path, small,
-                                            changes.sun.has_value() || changes.sky.has_value()));
+  FP_ASSIGN_OR_RETURN(BenchScene made, Load(name_or_path, small, changes));
   Scene& scene = made.scene;
   if (changes.sun) {
     PunctualLight sun;
