@@ -57,7 +57,7 @@ TEST(BenchProgram, MicroLeavesItsReport) {
       RunArgs({"micro", "--quick", "--filter", "tree_cut", "-o", folder.path().string()});
   ASSERT_EQ(ran.code, 0) << ran.err;
   EXPECT_THAT(ran.out, HasSubstr("tree_cut/sort"));
-  EXPECT_EQ(nlohmann::json::parse(ReadText(folder / "micro.json"))["benchmarks"].size(), 6u);
+  EXPECT_EQ(nlohmann::json::parse(ReadText(folder / "micro.json"))["benchmarks"].size(), 7u);
 }
 
 TEST(BenchProgram, PlannedBenchmarksEndWithUsage) {
