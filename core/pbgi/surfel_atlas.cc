@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdlib>
+#include <limits>
 
 #include "core/math/sampling.h"
 
@@ -16,6 +17,12 @@ constexpr float kSameSurfaceCosine = 0.5f;
 // A point this many spacings off a surfel's plane lies on another surface (or on a strong bend).
 // Sponza, 1 M surfels: bias -1.5 % without this, -0.8 % with 0.1.
 constexpr float kSamePlane = 0.1f;
+// Where surfels within a spacing of a point differ by more than this, none of them stands for it:
+// at the border of a shadow, and under what stands on a surface. What is buried there is never hit,
+// but it is read by what is seen beside it: kitchen, 305,549 surfels: bias -6.2 % without this,
+// +0.9 % with it; Sponza, 1 M: -1.0 % and +0.25 %, rr 0.0635 and 0.0608, 14 % and 20 % of the hits
+// shaded.
+constexpr float kLeastContrast = 0.25f;
 
 uint64_t KeyOf(int64_t x, int64_t y, int64_t z) {
   return static_cast<uint64_t>(x) << 42 | static_cast<uint64_t>(y) << 21 | static_cast<uint64_t>(z);
@@ -86,7 +93,7 @@ const SurfelGrid::Cell* SurfelGrid::FindCell(uint64_t key) const {
   return &cells_[at];
 }
 
-std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n) const {
+std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front) const {
   if (entries_.empty()) return std::nullopt;
   const Vec3f q = (p - low_) * inverse_cell_ - Vec3f(0.5f);
   const int64_t x0 = static_cast<int64_t>(std::floor(q.x));
@@ -96,15 +103,21 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n) const {
     return std::nullopt;
   }
   const uint32_t first = tree_.first_group(0);
-  float best = spacing_m_ * spacing_m_ * 2.25f;
-  uint32_t found = ~0u;
-  bool front = true;
+  // Surfels that are wound as the surface is come first: on the far side of a thin board, and where
+  // two objects touch, there are others as near, whose backs are inside.
+  const float farthest = spacing_m_ * spacing_m_ * 2.25f;
+  float best[2] = {farthest, farthest};
+  uint32_t found[2] = {~0u, ~0u};
+  // Of those within a spacing, of each winding.
+  float darkest[2] = {std::numeric_limits<float>::infinity(),
+                      std::numeric_limits<float>::infinity()};
+  float brightest[2] = {0, 0};
   for (int i = 0; i < 8; ++i) {
     const Cell* cell = FindCell(KeyOf(x0 + (i & 1), y0 + (i >> 1 & 1), z0 + (i >> 2)));
     if (cell == nullptr) continue;
     for (uint32_t e = cell->first; e < cell->first + cell->count; ++e) {
       const float d2 = Length2(entries_[e].position - p);
-      if (!(d2 < best)) continue;
+      if (!(d2 < farthest)) continue;
       const uint32_t slot = entries_[e].slot;
       const NodeGroup& g = tree_.group(first + slot / kLanes);
       const unsigned k = slot % kLanes;
@@ -113,14 +126,26 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n) const {
       const Vec3f d = p - entries_[e].position;
       const float off = g.nx[k] * d.x + g.ny[k] * d.y + g.nz[k] * d.z;
       if (!(std::fabs(off) <= kSamePlane * spacing_m_)) continue;
-      best = d2;
-      found = slot;
-      front = cosine > 0.0f;
+      const int turned = cosine > 0.0f ? 0 : 1;
+      if (d2 < spacing_m_ * spacing_m_) {
+        const RadianceGroup::Sides& sides =
+            tree_.radiance(first + slot / kLanes).lane[slot % kLanes];
+        const Rgb& l = front == (turned == 0) ? sides.front : sides.back;
+        const float sum = l.x + l.y + l.z;
+        darkest[turned] = std::min(darkest[turned], sum);
+        brightest[turned] = std::max(brightest[turned], sum);
+      }
+      if (!(d2 < best[turned])) continue;
+      best[turned] = d2;
+      found[turned] = slot;
     }
   }
-  if (found == ~0u) return std::nullopt;
-  const RadianceGroup::Sides& sides = tree_.radiance(first + found / kLanes).lane[found % kLanes];
-  return front ? sides.front : sides.back;
+  const int turned = found[0] != ~0u ? 0 : 1;
+  if (found[turned] == ~0u) return std::nullopt;
+  if (darkest[turned] < kLeastContrast * brightest[turned]) return std::nullopt;
+  const uint32_t slot = found[turned];
+  const RadianceGroup::Sides& sides = tree_.radiance(first + slot / kLanes).lane[slot % kLanes];
+  return front == (turned == 0) ? sides.front : sides.back;
 }
 
 namespace {
@@ -201,7 +226,7 @@ uint64_t SurfelAtlas::Resolve(uint32_t triangle, uint32_t column, uint32_t row, 
     b2 = (static_cast<float>(row) + 1.0f / 3) * inverse;
   }
   const Vec3f n = scene_.GeometricNormal(triangle);
-  const std::optional<Rgb> found = grid_.Find(scene_.PointOn(triangle, b1, b2), front ? n : -n);
+  const std::optional<Rgb> found = grid_.Find(scene_.PointOn(triangle, b1, b2), n, front);
   return found ? Encode(*found) : kResolved | kNone;
 }
 

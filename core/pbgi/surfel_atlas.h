@@ -21,10 +21,12 @@ class SurfelGrid {
   // `tree` must outlive the grid.
   explicit SurfelGrid(const PointTree& tree);
 
-  // The radiance [W/(m² sr)] on the side of `n` (unit) of the nearest surfel within 1.5 spacings of
-  // `p` whose plane is within 60° of n's and passes within a tenth of a spacing of p; none if there
-  // is none.
-  std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n) const;
+  // The radiance [W/(m² sr)] on the front (`n`, unit) or back of a surface at `p`: that of the
+  // nearest surfel within 1.5 spacings whose plane is within 60° of n's and passes within a tenth
+  // of a spacing of p, of those that look along n if there are any, else of those that look
+  // against it; none if there is none, and where those within one spacing differ more than
+  // fourfold.
+  std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front) const;
 
   // sqrt(mean area of a surfel); 0 for an empty tree.
   float spacing_m() const { return spacing_m_; }

@@ -114,19 +114,22 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
         const Vec3f ns = side == 0 ? ns_front : -ns_front;
         const uint64_t side_key = HashKey(key, side);
-        if ((visible & bit) == 0) {
-          const Rgb probe = lights.Irradiance(p, ng, ns, 1, side_key, 0, 0, light_counters);
-          if (!(MaxComponent(probe) > 0.0f)) {
+        // A side that seems to lie inside is believed to only if no light reaches it by any of the
+        // rays that it would be shaded with: a room whose walls are modelled outside in shows its
+        // back faces everywhere, and a single ray would darken its penumbras.
+        const bool open = (visible & bit) != 0;
+        if (black && open && !options.no_skip) {
+          ++counts.black;
+          continue;
+        }
+        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters);
+        if (!open) {
+          if (!(MaxComponent(e) > 0.0f)) {
             ++counts.inside;
             continue;
           }
           visible |= bit;
         }
-        if (black && !options.no_skip) {
-          ++counts.black;
-          continue;
-        }
-        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters);
         (side == 0 ? out.front : out.back)[i] = albedo * e * kInvPif;
       }
       out.visible_sides[i] = visible;

@@ -40,7 +40,7 @@ TEST(SurfelGrid, FindsTheNearestOfTheRightSide) {
   const auto tree = RandomCloud(500, 9).Build();
   const SurfelGrid grid(*tree);
   const uint32_t first = tree->first_group(0);
-  int found = 0;
+  int found = 0, turned = 0;
   for (uint64_t i = 0; i < 2000; ++i) {
     const auto u = [&](uint64_t k) {
       return ToUnitFloat(static_cast<uint32_t>(HashKey(77, i, k)));
@@ -54,39 +54,81 @@ TEST(SurfelGrid, FindsTheNearestOfTheRightSide) {
         Vec3f(near.cx[lane], near.cy[lane], near.cz[lane]) +
         frame.ToWorld({2 * u(0) - 1, 2 * u(1) - 1, 0.4f * u(2) - 0.2f}) * grid.spacing_m();
     const Vec3f n = u(3) < 0.5f ? frame.n : -frame.n;
-    // The literal search over all surfels.
-    float best = 2.25f * grid.spacing_m() * grid.spacing_m();
-    std::optional<Rgb> expected;
+    const bool front = u(4) < 0.5f;
+    // The literal search over all surfels, those that look along n and those that look against it.
+    const float spacing2 = grid.spacing_m() * grid.spacing_m();
+    float best[2] = {2.25f * spacing2, 2.25f * spacing2};
+    float darkest[2] = {1e30f, 1e30f}, brightest[2] = {0, 0};
+    std::optional<Rgb> nearest[2];
     for (uint32_t s = 0; s < tree->surfel_count(); ++s) {
       const NodeGroup& g = tree->group(first + s / kLanes);
       const uint32_t k = s % kLanes;
       const Vec3f c(g.cx[k], g.cy[k], g.cz[k]), m(g.nx[k], g.ny[k], g.nz[k]);
-      if (std::fabs(Dot(m, n)) <= 0.5f || !(Length2(c - p) < best)) continue;
+      if (std::fabs(Dot(m, n)) <= 0.5f) continue;
       if (std::fabs(Dot(m, p - c)) > 0.1f * grid.spacing_m()) continue;
-      // The grid looks only at the eight cells about p, which hold all within one spacing.
-      best = Length2(c - p);
+      const int against = Dot(m, n) > 0 ? 0 : 1;
       const auto& sides = tree->radiance(first + s / kLanes).lane[k];
-      expected = Dot(m, n) > 0 ? sides.front : sides.back;
+      const Rgb& radiance = front == (against == 0) ? sides.front : sides.back;
+      const float d2 = Length2(c - p);
+      if (d2 < spacing2) {
+        const float sum = radiance.x + radiance.y + radiance.z;
+        darkest[against] = std::min(darkest[against], sum);
+        brightest[against] = std::max(brightest[against], sum);
+      }
+      if (!(d2 < best[against])) continue;
+      best[against] = d2;
+      nearest[against] = radiance;
     }
-    const std::optional<Rgb> got = grid.Find(p, n);
-    if (expected && best <= grid.spacing_m() * grid.spacing_m()) {
-      ASSERT_TRUE(got.has_value()) << i;
-      EXPECT_EQ(*got, *expected) << i;
-      ++found;
-    }
-    if (!expected) {
+    const std::optional<Rgb> got = grid.Find(p, n, front);
+    if (!nearest[0] && !nearest[1]) {
       EXPECT_FALSE(got.has_value()) << i;
+      continue;
     }
+    // The grid looks only at the eight cells about p, which hold all within one spacing.
+    const int against = nearest[0] ? 0 : 1;
+    if (best[against] > spacing2) continue;
+    if (darkest[against] < 0.25f * brightest[against]) {
+      EXPECT_FALSE(got.has_value()) << i;
+      continue;
+    }
+    ASSERT_TRUE(got.has_value()) << i;
+    EXPECT_EQ(*got, *nearest[against]) << i;
+    ++found;
+    turned += against;
   }
+  EXPECT_GT(turned, 20);
   EXPECT_GT(found, 500);
 }
 
 TEST(SurfelGrid, AnEmptyTreeHasNothing) {
   const auto tree = TestCloud().Build();
   const SurfelGrid grid(*tree);
-  EXPECT_FALSE(grid.Find({0, 0, 0}, {0, 0, 1}).has_value());
+  EXPECT_FALSE(grid.Find({0, 0, 0}, {0, 0, 1}, true).has_value());
   const auto scene = Plane();
   EXPECT_FALSE(SurfelAtlas(*scene, *tree).Radiance(0, 0.3f, 0.3f, true).has_value());
+}
+
+// What stands on a surface hides the surfels under it, and they are dark: beside it they must not
+// be read. Two boards that touch, wound against each other: each reads its own.
+TEST(SurfelGrid, ReadsNeitherWhatIsBuriedNorTheOtherSideOfABoard) {
+  TestCloud t;
+  for (int j = 0; j < 20; ++j) {
+    for (int i = 0; i < 20; ++i) {
+      const Vec3f p(0.1f * static_cast<float>(i), 0.1f * static_cast<float>(j), 0);
+      const bool buried = i < 10;
+      t.Add(p, {0, 0, 1}, 0.01f, buried ? Rgb() : Rgb(1, 1, 1), Rgb(5, 5, 5));
+      t.Add(p + Vec3f(0.01f, 0.01f, -0.005f), {0, 0, -1}, 0.01f, Rgb(2, 2, 2), Rgb());
+    }
+  }
+  const auto tree = t.Build();
+  const SurfelGrid grid(*tree);
+  EXPECT_FALSE(grid.Find({0.94f, 1, 0}, {0, 0, 1}, true).has_value());
+  EXPECT_EQ(grid.Find({0.5f, 1, 0}, {0, 0, 1}, true).value(), Rgb());
+  for (const float x : {0.0f, 0.003f, 0.008f, 0.012f}) {
+    EXPECT_EQ(grid.Find({1.5f + x, 1 + x, -0.003f}, {0, 0, 1}, true).value(), Rgb(1, 1, 1));
+    EXPECT_EQ(grid.Find({1.5f + x, 1 + x, -0.003f}, {0, 0, 1}, false).value(), Rgb(5, 5, 5));
+    EXPECT_EQ(grid.Find({1.5f + x, 1 + x, -0.003f}, {0, 0, -1}, true).value(), Rgb(2, 2, 2));
+  }
 }
 
 TEST(SurfelAtlas, EveryPointReadsASurfelNearItOnItsSide) {
