@@ -324,7 +324,7 @@ void LightSampler::Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f
 
 Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
                              uint64_t key, uint32_t first_index, unsigned dimension,
-                             LightCounters& counters) const {
+                             LightCounters& counters, bool refine) const {
   const Query q{p, ng, n, accel_->LeaveSurface(p, ng), samples, key, first_index, dimension};
   Rgb irradiance;
   const uint32_t few = std::max(samples, kFewLights);
@@ -342,13 +342,31 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
   } else {
     irradiance += FromPunctualLights(q, counters);
   }
-  if (!emitters_.empty()) irradiance += FromEmitters(q, counters);
+  if (!emitters_.empty()) {
+    irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
+  }
   if (environment_ != nullptr) {
-    irradiance += FromMap(q, counters);
+    irradiance += Refined(&LightSampler::FromMap, q, refine, counters);
   } else if (has_sky_) {
-    irradiance += FromSky(q, counters);
+    irradiance += Refined(&LightSampler::FromSky, q, refine, counters);
   }
   return irradiance;
+}
+
+Rgb LightSampler::Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const,
+                          const Query& q, bool refine, LightCounters& counters) const {
+  const uint64_t rays = counters.rays, blocked = counters.blocked;
+  const Rgb first = (this->*from)(q, counters);
+  if (!refine || counters.blocked == blocked ||
+      counters.blocked - blocked == counters.rays - rays) {
+    return first;
+  }
+  // The rest of an aligned range of kRefined times the samples.
+  Query more = q;
+  more.first_index = q.first_index * kRefined + q.samples;
+  more.samples = (kRefined - 1) * q.samples;
+  const Rgb rest = (this->*from)(more, counters);
+  return (first + rest * static_cast<float>(kRefined - 1)) * (1.0f / kRefined);
 }
 
 Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
@@ -380,7 +398,10 @@ Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
   ++counters.rays;
   // A light's ray ends a surface offset short of it, in case it touches a surface itself.
   const float t_max = d_m - 2.0f * accel_->surface_offset_m();
-  if (t_max > 0.0f && accel_->Occluded(q.origin, to_light, t_max)) return {};
+  if (t_max > 0.0f && accel_->Occluded(q.origin, to_light, t_max)) {
+    ++counters.blocked;
+    return {};
+  }
   return arriving * cosine;
 }
 
@@ -478,7 +499,10 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
     const float reach_m =
         point->distance_m * (1.0f - 2.0f * accel_->surface_offset_m() / point->height_m);
     ++counters.rays;
-    if (reach_m > 0.0f && accel_->Occluded(q.origin, point->direction, reach_m)) continue;
+    if (reach_m > 0.0f && accel_->Occluded(q.origin, point->direction, reach_m)) {
+      ++counters.blocked;
+      continue;
+    }
     sum += radiance * (Dot(q.n, point->direction) * point->inverse_pdf_sr /
                        static_cast<float>(choice->probability));
   }
@@ -495,7 +519,11 @@ Rgb LightSampler::FromSky(const Query& q, LightCounters& counters) const {
                                        OwenSobol(q.first_index + i, q.dimension + 1, seed)));
     if (!(Dot(q.ng, w) > 0.0f)) continue;
     ++counters.rays;
-    if (!accel_->Occluded(q.origin, w)) ++open;
+    if (accel_->Occluded(q.origin, w)) {
+      ++counters.blocked;
+    } else {
+      ++open;
+    }
   }
   return accel_->scene().sky() * (kPif * static_cast<float>(open) / static_cast<float>(q.samples));
 }
@@ -515,7 +543,11 @@ Rgb LightSampler::FromMap(const Query& q, LightCounters& counters) const {
       continue;
     }
     ++counters.rays;
-    if (!accel_->Occluded(q.origin, draw->direction)) sum += draw->contribution;
+    if (accel_->Occluded(q.origin, draw->direction)) {
+      ++counters.blocked;
+    } else {
+      sum += draw->contribution;
+    }
   }
   return sum / static_cast<float>(q.samples);
 }

@@ -21,6 +21,7 @@ namespace farpoint {
 // Which shadow rays an estimate took and saved.
 struct LightCounters {
   uint64_t rays = 0;
+  uint64_t blocked = 0;              // of the rays
   uint64_t samples = 0;              // lights, points on emitters, directions of the map drawn
   uint64_t skipped_facing_away = 0;  // nothing arrives unshadowed: behind the surface, out of range
                                      // or cone, seen edge-on, or a hole
@@ -55,8 +56,16 @@ class LightSampler {
   // sequence: the same key with disjoint aligned index ranges gives one stratified set.
   // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
   // for the same index take dimensions 0 and 1 passes 2, or the two would be correlated.
+  // `refine`: emitters and the environment each get kRefined times the samples where some of the
+  // first `samples` rays are blocked and others are not, in penumbras; the first ones count among
+  // them. (What a first set of equals misses is too small to be seen, and lost on both sides of a
+  // penumbra, so that the mean stays: less than p(1 - p)^samples of the unshadowed light, p the
+  // smaller share.)
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
-                 uint32_t first_index, unsigned dimension, LightCounters& counters) const;
+                 uint32_t first_index, unsigned dimension, LightCounters& counters,
+                 bool refine = false) const;
+
+  static constexpr uint32_t kRefined = 4;
 
  private:
   // What an estimate is made for.
@@ -68,6 +77,9 @@ class LightSampler {
     uint32_t first_index;
     unsigned dimension;
   };
+  // Of one of the From… below: its estimate, and in a penumbra a finer one.
+  Rgb Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const, const Query& q,
+              bool refine, LightCounters& counters) const;
   struct Emitter {
     Vec3f v0, e1, e2;  // a vertex and the two edges from it
     Vec3f normal;      // unit

@@ -14,6 +14,9 @@ namespace {
 
 // A surface seen at a slant spans more than a pixel's footprint from pixel to pixel.
 constexpr float kSlantedFootprints = 4.0f;
+// Of the bound that a record's place above a receiver's plane sets. Of 1 and 2, rr: macross 0.102,
+// 0.084, Sponza 0.055, 0.057 (none: 0.106, 0.061), records +6 %, +15 %.
+constexpr float kAboveScale = 2.0f;
 // Keys of independent random choices.
 enum : uint64_t { kKeyJitter = 21, kKeyGather = 22 };
 
@@ -66,6 +69,11 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     // something else.
     const F8 off = Abs8(dx * (nx + Set8(g.normal.x)) + dy * (ny + Set8(g.normal.y)) +
                         dz * (nz + Set8(g.normal.z)));
+    // The record's own place is a surface: how far above the receiver's plane, over the distance²
+    // (both underflow only where they mean nothing).
+    const F8 above = Max8(zero - (dx * nx + dy * ny + dz * nz), zero);
+    const F8 apart = Max8(distance * distance, Set8(std::numeric_limits<float>::min()));
+    finest = Max8(finest, Set8(kAboveScale) * above / apart * Max8(screen, zero));
     const F8 inverse_reach = Set8(1.0f / g.reach_m);
     const F8 away = distance + off;
     const F8 w = one - away * inverse_reach - turned;
@@ -75,6 +83,13 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
   }
 
   for (auto& share : shares) share.fill(0.0f);
+  // Where the bound leaves nothing, it is lifted.
+  F8 left = zero;
+  for (const Term& term : terms) {
+    const F8 inverse_reach = Set8(1.0f / records[term.record]->gather.reach_m);
+    left = Max8(left, term.rest - term.away * Max8(inverse_reach, finest));
+  }
+  finest = Select8(left > zero, finest, zero);
   F8 sum[3] = {zero, zero, zero}, weights = zero;
   for (const Term& term : terms) {
     const GatherRecord& g = records[term.record]->gather;
@@ -101,7 +116,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     }
   }
   for (size_t i = 0; i < count; ++i) {
-    weight[i] = weights[i];
+    weight[i] = left[i] > 0.0f ? weights[i] : 0.0f;
     const float inverse = weights[i] > 0.0f ? 1.0f / weights[i] : 0.0f;
     irradiance[i] = Rgb(sum[0][i], sum[1][i], sum[2][i]) * inverse;
   }

@@ -20,7 +20,11 @@
 // is less, the harmonic distance, or one footprint (then the gradient is reduced in proportion).
 // The bound b keeps a record of the open from weighing where others, that came after it, tell of
 // something near (the neighbour clamping of Křivánek et al. 2006, the other way round): of all
-// records j that weigh at x, 1/b = max_j sqrt(w_j)/a_j, with b = ∞ in w_j.
+// records j that weigh at x, 1/b >= sqrt(w_j)/a_j, with b = ∞ in w_j; and since the places of
+// records are surfaces, of all that lie above x's plane, 1/b >= 2 (c_j - x)·n / |c_j - x|² times
+// the second factor of w_j: in a groove the light changes within the groove's width. Where no
+// record weighs under the bound, the sum of weights is 0 (and a candidate gets its record), and the
+// irradiance is blended without it.
 #pragma once
 
 #include <array>
@@ -78,9 +82,10 @@ struct ServedReceiver {
   float x_px, y_px;  // in the image
 };
 
-// Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs. What a
-// receiver gets depends on the records that weigh on it and on their order, not on the other
-// receivers. `shares`: none, or for each record its w at each receiver.
+// Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs (see b
+// for where only b is why). What a receiver gets depends on the records that weigh on it and on
+// their order, not on the other receivers. `shares`: none, or for each record its w at each
+// receiver.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
                   std::span<float> weight, std::span<std::array<float, 8>> shares = {});

@@ -375,7 +375,7 @@ class Renderer final : public FrameRenderer {
       sample.direct_e = scene_.lights->Irradiance(
           receivers[r].position, receivers[r].geometric_normal, receivers[r].normal, each,
           PixelKey(block, sample_of[r], kKeyDirect), (sample_of[r] % settings_.spp) * each, 0,
-          counters);
+          counters, true);
     }
     n.rays += counters.rays;
     n.skipped_shadow += counters.skipped_facing_away;

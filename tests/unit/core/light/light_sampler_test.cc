@@ -867,6 +867,53 @@ TEST(LightSampler, IndexRangesOfOneKeyAreOneSet) {
   EXPECT_LT(one_set.variance(), 0.25 * independent.variance());
 }
 
+// A panel over a floor with a wall between them: in the penumbra four times the rays, elsewhere the
+// same bits as ever.
+TEST(LightSampler, RefinesPenumbrasOnly) {
+  Scene scene;
+  const auto quad = [&](const Vec3f& a, const Vec3f& b, const Vec3f& c, const Vec3f& d,
+                        float light) {
+    Mesh mesh;
+    mesh.positions = {a, b, c, d};
+    mesh.triangles = {{0, 1, 2}, {0, 2, 3}};
+    mesh.material = static_cast<uint32_t>(scene.materials.size());
+    Material material;
+    material.emission = Rgb(light, light, light);
+    scene.materials.push_back(material);
+    Instance instance;
+    instance.mesh = static_cast<uint32_t>(scene.meshes.size());
+    scene.meshes.push_back(mesh);
+    scene.instances.push_back(instance);
+  };
+  quad({-1, -1, 4}, {1, -1, 4}, {1, 1, 4}, {-1, 1, 4}, 5);  // panel
+  quad({0, -9, 2}, {9, -9, 2}, {9, 9, 2}, {0, 9, 2}, 0);    // half a ceiling
+  quad({-9, -9, 0}, {9, -9, 0}, {9, 9, 0}, {-9, 9, 0}, 0);  // floor
+  const Lit lit(scene);
+  const auto estimate = [&](double x, bool refine, uint64_t key, LightCounters& counters) {
+    return static_cast<double>(
+        lit.sampler()
+            .Irradiance(lit.Local({x, 0, 0}), {0, 0, 1}, {0, 0, 1}, 8, key, 0, 0, counters, refine)
+            .x);
+  };
+  for (const double x : {-3.0, 3.0}) {  // all of the panel is seen, none of it
+    LightCounters a, b;
+    EXPECT_EQ(estimate(x, false, 1, a), estimate(x, true, 1, b));
+    EXPECT_EQ(a.rays, b.rays);
+    EXPECT_EQ(b.blocked, x < 0 ? 0u : b.rays);
+  }
+  Estimate plain, refined;
+  LightCounters few, many;
+  for (uint64_t key = 0; key < 2000; ++key) {
+    plain.Add(estimate(0.2, false, key, few));
+    refined.Add(estimate(0.2, true, key, many));
+  }
+  EXPECT_GT(many.rays, 3.5 * static_cast<double>(few.rays));
+  EXPECT_LE(many.rays, 4 * few.rays);
+  EXPECT_LT(refined.variance(), 0.3 * plain.variance());
+  EXPECT_NEAR(refined.mean(), plain.mean(),
+              4 * std::hypot(plain.standard_error(), refined.standard_error()));
+}
+
 TEST(LightSampler, IsAFunctionOfItsArguments) {
   const Lit lit = HalfOpen();
   EXPECT_EQ(lit.E({0, 0, 0}, kUp, 16, 4), lit.E({0, 0, 0}, kUp, 16, 4));

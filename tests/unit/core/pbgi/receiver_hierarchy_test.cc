@@ -145,11 +145,13 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
   }
   std::vector<Rgb> e(8);
   std::vector<float> weight(8);
+  int weighed = 0;
   std::vector<std::array<float, 8>> shares(list.size());
   BlendRecords(list, served, e, weight, shares);
   for (size_t i = 0; i < 8; ++i) {
     Vec3d sum;
     double weights = 0, finest = 0, scale = 0;
+    std::vector<double> expected(records.size());
     const Receiver& x = receivers[i];
     // Of all records first the finest scale that they tell of, then the weights that it leaves.
     for (const bool weighs : {false, true}) {
@@ -166,9 +168,11 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
                       static_cast<double>(kNormalTolerance));
         const double inverse = std::max(1 / static_cast<double>(r.gather.reach_m), finest);
         const double w = 1 - (Length(d) + off) * inverse - turned;
-        if (weighs) {
-          EXPECT_NEAR(shares[k][i], w > 0 && screen > 0 ? w * w * screen * screen : 0, 1e-5);
+        if (!weighs && screen > 0) {
+          const double above = std::max(0.0, -Dot(d, Vec3d(x.normal)));
+          scale = std::max(scale, 2 * above / Dot(d, d) * screen);
         }
+        if (weighs) expected[k] = w > 0 && screen > 0 ? w * w * screen * screen : 0;
         if (!(w > 0) || !(screen > 0)) continue;
         if (weighs) {
           weights += w * w * screen * screen;
@@ -179,7 +183,12 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
       }
       finest = scale;
     }
-    ASSERT_GT(weights, 0) << i;
+    if (!(weights > 0)) {
+      EXPECT_EQ(weight[i], 0) << i;
+      continue;
+    }
+    ++weighed;
+    for (size_t k = 0; k < records.size(); ++k) EXPECT_NEAR(shares[k][i], expected[k], 1e-5);
     EXPECT_NEAR(weight[i], weights, 1e-4 * weights) << i;
     EXPECT_NEAR(e[i].x, sum.x / weights, 2e-4) << i;
     EXPECT_NEAR(e[i].y, sum.y / weights, 2e-4) << i;
@@ -190,6 +199,7 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
     EXPECT_EQ(alone, e[i]);
     EXPECT_EQ(alone_weight, weight[i]);
   }
+  EXPECT_GT(weighed, 3);
 }
 
 // A record of the open, coarse and far-reaching, beside one that tells of something near.
@@ -227,6 +237,40 @@ TEST(ReceiverHierarchy, ARecordOfTheOpenDoesNotReachIntoACorner) {
     EXPECT_GE(e, before - 1e-5f) << px;
     before = e;
   }
+}
+
+// A receiver at the bottom of a groove, between records on the level above it: they do not know
+// what it sees, and it must get a record of its own.
+TEST(ReceiverHierarchy, ARecordAboveTheReceiversPlaneBoundsTheScale) {
+  ScreenRecord beside, above;
+  beside.screen_reach_px = above.screen_reach_px = 24;
+  beside.x_px = 8;
+  beside.gather.position = {0.8f, 0, 0};
+  beside.gather.normal = above.gather.normal = {0, 0, 1};
+  beside.gather.reach_m = above.gather.reach_m = 2;
+  beside.gather.irradiance = {1, 1, 1};
+  above.x_px = 1;
+  above.gather.position = {0.1f, 0, 0.1f};
+  above.gather.irradiance = {3, 3, 3};
+  Receiver r;
+  r.normal = {0, 0, 1};
+  const ServedReceiver served{&r, 0, 0};
+  const ScreenRecord* flat[] = {&beside};
+  const ScreenRecord* both[] = {&beside, &above};
+  Rgb e;
+  float weight;
+  BlendRecords(flat, {&served, 1}, {&e, 1}, {&weight, 1});
+  EXPECT_GT(weight, 0.2f);
+  EXPECT_EQ(e, Rgb(1, 1, 1));
+  // 1/b = 2 * 0.1 / 0.02: nothing further than 0.1 m weighs, and neither of the two does.
+  BlendRecords(both, {&served, 1}, {&e, 1}, {&weight, 1});
+  EXPECT_EQ(weight, 0);
+  EXPECT_GT(e.x, 1);
+  EXPECT_LT(e.x, 3);
+  // What lies below bounds nothing.
+  above.gather.position.z = -0.1f;
+  BlendRecords(both, {&served, 1}, {&e, 1}, {&weight, 1});
+  EXPECT_GT(weight, 0.2f);
 }
 
 TEST(ReceiverHierarchy, StopsWhenItIsTold) {
