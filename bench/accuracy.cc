@@ -272,8 +272,11 @@ class Runner {
     result.records = rendered.stats.counts["clusters"];
     if (receivers > 0) {
       result.us_per_receiver = 1e6 * GatherSeconds(rendered.stats) / receivers;
+      // Rays, with those of refined strata; a gather by cuts has none, only strata.
+      const uint64_t rays = rendered.stats.counts["gather_rays"];
       result.samples_per_pixel =
-          static_cast<double>(rendered.stats.counts["cluster_samples"]) / receivers;
+          static_cast<double>(rays > 0 ? rays : rendered.stats.counts["cluster_samples"]) /
+          receivers;
     }
 
     FP_ASSIGN_OR_RETURN(const Truth truth, MakeTruth(c, source->scene, loaded, rendered.film));

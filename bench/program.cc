@@ -75,6 +75,11 @@ absl::Status Accuracy(const BenchCommandLine& line, std::ostream& out, std::ostr
   out << AccuracyTable(report) << "\n"
       << (dir / "accuracy.json").string() << "\n"
       << (dir / "accuracy.html").string() << "\n";
+  if (report.results.empty() && report.checks.empty()) {
+    return absl::InvalidArgumentError(
+        "accuracy: nothing was measured: the cases that were asked for need --scenes DIR or "
+        "--references DIR with their files (the report lists what was left out)");
+  }
   return absl::OkStatus();
 }
 

@@ -106,8 +106,9 @@ std::vector<uint8_t> PerceptiblyDifferent(const RgbImage& a, const RgbImage& b,
   const double degrees = 2.0 * std::tan(viewing.field_of_view_deg * kPi / 360.0) * 180.0 / kPi;
   const int view_width = viewing.view_width > 0 ? viewing.view_width : a[0].width;
   const double pixels_per_degree = view_width / degrees;
+  // The first level whose pixels span more than a degree.
   int adaptation_level = 0;
-  for (double pixels = 1; adaptation_level + 1 < kLevels && 2 * pixels <= degrees; pixels *= 2) {
+  for (double pixels = 1; adaptation_level + 1 < kLevels && pixels <= degrees; pixels *= 2) {
     ++adaptation_level;
   }
 

@@ -355,18 +355,31 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
 
 Rgb LightSampler::Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const,
                           const Query& q, bool refine, LightCounters& counters) const {
-  const uint64_t rays = counters.rays, blocked = counters.blocked;
-  const Rgb first = (this->*from)(q, counters);
-  if (!refine || counters.blocked == blocked ||
-      counters.blocked - blocked == counters.rays - rays) {
-    return first;
+  if (!refine || q.samples < kFewestRefined) return (this->*from)(q, counters);
+  // Two halves, independent of each other: each decides whether the other one is refined.
+  Query half[2] = {q, q};
+  Rgb mean[2];
+  bool mixed[2];
+  for (int i = 0; i < 2; ++i) {
+    half[i].samples = i == 0 ? q.samples / 2 : q.samples - q.samples / 2;
+    half[i].key = HashKey(q.key, 7, i, q.first_index);
+    half[i].first_index = 0;
+    const uint64_t rays = counters.rays, blocked = counters.blocked;
+    mean[i] = (this->*from)(half[i], counters);
+    mixed[i] = counters.blocked != blocked && counters.blocked - blocked != counters.rays - rays;
   }
-  // The rest of an aligned range of kRefined times the samples.
-  Query more = q;
-  more.first_index = q.first_index * kRefined + q.samples;
-  more.samples = (kRefined - 1) * q.samples;
-  const Rgb rest = (this->*from)(more, counters);
-  return (first + rest * static_cast<float>(kRefined - 1)) * (1.0f / kRefined);
+  Rgb sum;
+  for (int i = 0; i < 2; ++i) {
+    if (mixed[1 - i]) {
+      Query rest = half[i];
+      rest.first_index = half[i].samples;
+      rest.samples = (kRefined - 1) * half[i].samples;
+      mean[i] = (mean[i] + (this->*from)(rest, counters) * static_cast<float>(kRefined - 1)) *
+                (1.0f / kRefined);
+    }
+    sum += mean[i] * (static_cast<float>(half[i].samples) / static_cast<float>(q.samples));
+  }
+  return sum;
 }
 
 Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,

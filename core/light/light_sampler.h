@@ -56,16 +56,15 @@ class LightSampler {
   // sequence: the same key with disjoint aligned index ranges gives one stratified set.
   // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
   // for the same index take dimensions 0 and 1 passes 2, or the two would be correlated.
-  // `refine`: emitters and the environment each get kRefined times the samples where some of the
-  // first `samples` rays are blocked and others are not, in penumbras; the first ones count among
-  // them. (What a first set of equals misses is too small to be seen, and lost on both sides of a
-  // penumbra, so that the mean stays: less than p(1 - p)^samples of the unshadowed light, p the
-  // smaller share.)
+  // `refine`: for emitters and for the environment, the samples are two independent halves, and
+  // each takes kRefined times as many where some rays of the *other* half are blocked and others
+  // are not. What decides is independent of what it decides about, so this too is unbiased. Not
+  // below kFewestRefined samples.
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
                  uint32_t first_index, unsigned dimension, LightCounters& counters,
                  bool refine = false) const;
 
-  static constexpr uint32_t kRefined = 4;
+  static constexpr uint32_t kRefined = 4, kFewestRefined = 4;
 
  private:
   // What an estimate is made for.

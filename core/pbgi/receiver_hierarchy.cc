@@ -87,7 +87,8 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
   F8 left = zero;
   for (const Term& term : terms) {
     const F8 inverse_reach = Set8(1.0f / records[term.record]->gather.reach_m);
-    left = Max8(left, term.rest - term.away * Max8(inverse_reach, finest));
+    const F8 w = term.rest - term.away * Max8(inverse_reach, finest);
+    left = Max8(left, Select8(term.screen > zero, w, zero));
   }
   finest = Select8(left > zero, finest, zero);
   F8 sum[3] = {zero, zero, zero}, weights = zero;

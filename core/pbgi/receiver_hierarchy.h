@@ -14,17 +14,17 @@
 //   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / min(a, b) - sqrt((1 - n·n_c) /
 //   kNormalTolerance))²
 //       · max(0, 1 - |p - p_c|² / ρ²)²,   ρ = kScreenReach s_l,
-// continuous and of compact support in all of its arguments. The reach a is `reach` times the
-// harmonic mean distance of what the record saw, at most E / (2 |∇E|), at most a coarser
-// neighbour's reach plus the distance to it, at least `floor_px` pixels' footprints or, where that
-// is less, the harmonic distance, or one footprint (then the gradient is reduced in proportion).
-// The bound b keeps a record of the open from weighing where others, that came after it, tell of
-// something near (the neighbour clamping of Křivánek et al. 2006, the other way round): of all
-// records j that weigh at x, 1/b >= sqrt(w_j)/a_j, with b = ∞ in w_j; and since the places of
-// records are surfaces, of all that lie above x's plane, 1/b >= 2 (c_j - x)·n / |c_j - x|² times
-// the second factor of w_j: in a groove the light changes within the groove's width. Where no
-// record weighs under the bound, the sum of weights is 0 (and a candidate gets its record), and the
-// irradiance is blended without it.
+// continuous and of compact support in all of its arguments (but for b where it is lifted). The
+// reach a is `reach` times the harmonic mean distance of what the record saw, at most E / (2 |∇E|),
+// at most a coarser neighbour's reach plus the distance to it, at least `floor_px` pixels'
+// footprints or, where that is less, the harmonic distance, or one footprint (then the gradient is
+// reduced in proportion). The bound b keeps a record of the open from weighing where others, that
+// came after it, tell of something near (the neighbour clamping of Křivánek et al. 2006, the other
+// way round): of all records j that weigh at x, 1/b >= sqrt(w_j)/a_j, with b = ∞ in w_j; and since
+// the places of records are surfaces, of all that lie above x's plane, 1/b >= 2 (c_j - x)·n / |c_j
+// - x|² times the second factor of w_j: in a groove the light changes within the groove's width.
+// Where no record weighs under the bound, the sum of weights is 0 (and a candidate gets its
+// record), and the irradiance is blended without it.
 #pragma once
 
 #include <array>

@@ -267,6 +267,22 @@ TEST(ReceiverHierarchy, ARecordAboveTheReceiversPlaneBoundsTheScale) {
   EXPECT_EQ(weight, 0);
   EXPECT_GT(e.x, 1);
   EXPECT_LT(e.x, 3);
+  // The same beside a receiver that the record above does weigh at, and that is out of the reach in
+  // the image that the first one is in.
+  ScreenRecord aside = beside;
+  aside.x_px = 30;
+  aside.gather.position = {0.001f, 0, 0};
+  const ScreenRecord* three[] = {&beside, &above, &aside};
+  Receiver other = r;
+  other.position = {0.1f, 0, 0.1f};
+  const ServedReceiver pair[] = {served, {&other, 29, 0}};
+  Rgb alone, both_e[2];
+  float alone_weight, both_weight[2];
+  BlendRecords(three, {&served, 1}, {&alone, 1}, {&alone_weight, 1});
+  BlendRecords(three, pair, both_e, both_weight);
+  EXPECT_EQ(both_e[0], alone);
+  EXPECT_EQ(both_weight[0], alone_weight);
+  EXPECT_GT(alone.x, 1);
   // What lies below bounds nothing.
   above.gather.position.z = -0.1f;
   BlendRecords(both, {&served, 1}, {&e, 1}, {&weight, 1});
