@@ -3,8 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstdlib>
-#include <ctime>
 #include <filesystem>
 #include <fstream>
 #include <memory>
@@ -14,6 +12,7 @@
 #include "bench/accuracy_checks.h"
 #include "bench/accuracy_frame.h"
 #include "bench/accuracy_pictures.h"
+#include "bench/machine.h"
 #include "bench/sparse_reference.h"
 #include "bench/text.h"
 #include "core/base/executor.h"
@@ -32,30 +31,6 @@ constexpr uint64_t kReferenceSeed = 0x9e3779b97f4a7c15ull;
 constexpr double kNoisePart = 1.0 / 3.0;  // of the bar
 constexpr int kPictureWidth = 640;
 constexpr float kInvPiF = 0.31830988618f;
-
-std::string CpuModel() {
-  std::ifstream info("/proc/cpuinfo");
-  for (std::string line; std::getline(info, line);) {
-    if (!line.starts_with("model name")) continue;
-    const size_t colon = line.find(": ");
-    if (colon != std::string::npos) return line.substr(colon + 2);
-  }
-  return "unknown";
-}
-
-double LoadAverage() {
-  double load = 0;
-  return getloadavg(&load, 1) == 1 ? load : 0.0;
-}
-
-std::string DateUtc() {
-  const std::time_t now = std::time(nullptr);
-  std::tm utc{};
-  gmtime_r(&now, &utc);
-  char text[32];
-  std::strftime(text, sizeof(text), "%Y-%m-%dT%H:%M:%SZ", &utc);
-  return text;
-}
 
 // The truth at some pixels, wherever it comes from.
 struct Truth {

@@ -4,15 +4,13 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
-#include <ctime>
-#include <fstream>
 #include <memory>
 #include <mutex>
 #include <set>
 #include <utility>
 
 #include "absl/strings/str_format.h"
+#include "bench/machine.h"
 #include "bench/sparse_reference.h"
 #include "bench/text.h"
 #include "core/base/clock.h"
@@ -53,30 +51,6 @@ Sweep SweepOf(bool quick) {
 
 // Decimal, as it was meant: 0.1f is 0.10000000149.
 double Decimal(float v) { return std::round(static_cast<double>(v) * 1e6) / 1e6; }
-
-double LoadAverage() {
-  double load = 0;
-  return getloadavg(&load, 1) == 1 ? load : 0.0;
-}
-
-std::string CpuModel() {
-  std::ifstream info("/proc/cpuinfo");
-  for (std::string line; std::getline(info, line);) {
-    if (!line.starts_with("model name")) continue;
-    const size_t colon = line.find(": ");
-    if (colon != std::string::npos) return line.substr(colon + 2);
-  }
-  return "unknown";
-}
-
-std::string DateUtc() {
-  const std::time_t now = std::time(nullptr);
-  std::tm utc{};
-  gmtime_r(&now, &utc);
-  char text[32];
-  std::strftime(text, sizeof(text), "%Y-%m-%dT%H:%M:%SZ", &utc);
-  return text;
-}
 
 uint64_t PeakRssBytes() {
   rusage usage{};

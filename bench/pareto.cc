@@ -3,14 +3,13 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <cstdlib>
-#include <ctime>
-#include <fstream>
 #include <memory>
 #include <utility>
 
 #include "absl/strings/str_format.h"
+#include "bench/accuracy_frame.h"
 #include "bench/bench_scene.h"
+#include "bench/machine.h"
 #include "bench/text.h"
 #include "core/base/clock.h"
 #include "core/base/executor.h"
@@ -23,8 +22,6 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array kGatherStages = {Stage::kCluster,   Stage::kCut,      Stage::kRaster,
-                                      Stage::kComposite, Stage::kConvolve, Stage::kTrace};
 constexpr std::array kPreparationStages = {Stage::kImport, Stage::kSample, Stage::kShade,
                                            Stage::kTree};
 // Any other number would do: see RunPareto.
@@ -66,36 +63,6 @@ Sweep SweepOf(bool quick) {
 
 double SecondsSince(std::chrono::steady_clock::time_point start) {
   return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
-double GatherSeconds(const Stats& stats) {
-  double sum = 0;
-  for (const Stage s : kGatherStages) sum += stats.seconds[static_cast<int>(s)];
-  return sum;
-}
-
-std::string CpuModel() {
-  std::ifstream info("/proc/cpuinfo");
-  for (std::string line; std::getline(info, line);) {
-    if (!line.starts_with("model name")) continue;
-    const size_t colon = line.find(": ");
-    if (colon != std::string::npos) return line.substr(colon + 2);
-  }
-  return "unknown";
-}
-
-double LoadAverage() {
-  double load = 0;
-  return getloadavg(&load, 1) == 1 ? load : 0.0;
-}
-
-std::string DateUtc() {
-  const std::time_t now = std::time(nullptr);
-  std::tm utc{};
-  gmtime_r(&now, &utc);
-  char text[32];
-  std::strftime(text, sizeof(text), "%Y-%m-%dT%H:%M:%SZ", &utc);
-  return text;
 }
 
 // The defaults put in, but for the resolution, which the reference may decide.

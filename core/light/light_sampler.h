@@ -59,7 +59,7 @@ class LightSampler {
   // `refine`: for emitters and for the environment, the samples are two independent halves, and
   // each takes kRefined times as many where some rays of the *other* half are blocked and others
   // are not. What decides is independent of what it decides about, so this too is unbiased. Not
-  // below kFewestRefined samples.
+  // below kFewestRefined samples. Index ranges of one key are then sets of their own.
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
                  uint32_t first_index, unsigned dimension, LightCounters& counters,
                  bool refine = false) const;

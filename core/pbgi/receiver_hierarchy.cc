@@ -49,7 +49,9 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
 
   // What reaches the receivers, and the finest scale that it tells of.
   struct Term {
-    F8 away, rest, screen;  // the first two of w's subtrahends, the third, and the second factor
+    F8 away;    // |x - c| + |(x - c)·(n + n_c)|, metres
+    F8 rest;    // 1 - sqrt((1 - n·n_c) / kNormalTolerance)
+    F8 screen;  // 1 - |p - p_c|² / ρ²
     size_t record;
   };
   thread_local AlignedVector<Term> terms;
