@@ -1,11 +1,12 @@
 #include "core/light/light_sampler.h"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <limits>
 #include <span>
 
-#include "core/math/elementary.h"
+#include "core/math/elementary8.h"
 #include "core/math/sampling.h"
 #include "core/math/simd8.h"
 
@@ -28,16 +29,34 @@ float RangeWindow(const PreparedLight& light, float d_m) {
   return std::clamp(1.0f - q2 * q2, 0.0f, 1.0f);
 }
 
-// A triangle that fills less than this is sampled by area: its solid angle, a difference of
-// angles, would lose its digits, and over so little the two densities are the same.
-constexpr double kSmallSolidAngle = 1e-3;
+// A triangle that fills less than this is sampled by area: the directions to its corners are too
+// near to each other for their digits, and over so little the two densities are the same.
+constexpr float kSmallSolidAngle = 1e-3f;
 
 // [0, 1) -> [0, 1] by the density that goes from f0 to f1 (> 0), by which `pdf` is multiplied.
-double SampleLinear(double u, double f0, double f1, double& pdf) {
-  const double x =
-      std::min(u * (f0 + f1) / (f0 + std::sqrt(f0 * f0 + u * (f1 * f1 - f0 * f0))), 1.0);
-  pdf *= 2.0 * (f0 + (f1 - f0) * x) / (f0 + f1);
+F8 SampleLinear(F8 u, F8 f0, F8 f1, F8& pdf) {
+  const F8 sum = f0 + f1;
+  const F8 x = Min8(u * sum / (f0 + Sqrt8(f0 * f0 + u * (f1 * f1 - f0 * f0))), Set8(1.0f));
+  pdf *= Set8(2.0f) * (f0 + (f1 - f0) * x) / sum;
   return x;
+}
+
+// As UniformTriangle.
+void UniformTriangle8(F8& u, F8& v) {
+  const F8 half = Set8(0.5f);
+  const M8 upper = v > u;
+  const F8 b1 = Select8(upper, u * half, u - v * half), b2 = Select8(upper, v - u * half, v * half);
+  u = b1;
+  v = b2;
+}
+
+// p[offset[k]] in lane k.
+F8 Gather8(const float* p, const std::array<int64_t, 8>& offset) {
+  const auto half = [&](int k) {
+    return _mm256_i64gather_ps(
+        p, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(offset.data() + k)), sizeof(float));
+  };
+  return reinterpret_cast<F8>(_mm256_set_m128(half(4), half(0)));
 }
 
 // The least power of a light beside one of power 1 that keeps it a normal number.
@@ -51,86 +70,95 @@ float InversePowerOfTwo(float x) {
 
 }  // namespace
 
-// By solid angle (Arvo 1995, "Stratified Sampling of Spherical Triangles"): bounded however near
-// the emitter comes, where sampling by area has the unbounded factor cosθ_l / d².
-std::optional<LightSampler::EmitterPoint> LightSampler::SamplePoint(const Emitter& e,
-                                                                    const Vec3f& p, const Vec3f& n,
-                                                                    float u, float v) const {
-  const Vec3d origin(p);
-  const Vec3d corner[3] = {Vec3d(e.v0) - origin, Vec3d(e.v0 + e.e1) - origin,
-                           Vec3d(e.v0 + e.e2) - origin};
-  const double length[3] = {Length(corner[0]), Length(corner[1]), Length(corner[2])};
-  const double height = Dot(corner[0], Vec3d(e.normal));  // of the plane over p, signed
-  if (!(length[0] > 0) || !(length[1] > 0) || !(length[2] > 0) || height == 0.0) {
-    return std::nullopt;  // at a corner, or in the triangle's plane: nothing arrives
+LightSampler::EmitterLanes LightSampler::LoadEmitters(const U8& place) const {
+  const auto load = [](const auto& of) {
+    const auto vector = [&](size_t first) { return V8(of(first), of(first + 1), of(first + 2)); };
+    return EmitterLanes{vector(0), vector(3), vector(6), vector(9), of(12), of(13)};
+  };
+  // The fields of a block, as EmitterBlock has them: eight floats each.
+  const auto* blocks = reinterpret_cast<const float*>(emitter_blocks_.data());
+  constexpr size_t kWidth = LightTree::kWidth;
+  static_assert(sizeof(EmitterBlock) == 14 * kWidth * sizeof(float));
+  if (emitter_tree_.is_one_block()) {
+    const auto lane = reinterpret_cast<__m256i>(place);
+    return load([&](size_t field) {
+      return reinterpret_cast<F8>(
+          _mm256_permutevar8x32_ps(_mm256_load_ps(blocks + field * kWidth), lane));
+    });
   }
-  const Vec3d a = corner[0] / length[0], b = corner[1] / length[1], c = corner[2] / length[2];
-  const double triple = std::fabs(Dot(a, Cross(b, c)));
-  const double solid_angle = 2.0 * DetAtan2(triple, 1.0 + Dot(a, b) + Dot(b, c) + Dot(c, a));
-  EmitterPoint out;
-  out.height_m = static_cast<float>(std::fabs(height));
-  if (!(solid_angle > kSmallSolidAngle)) {
-    const Vec2f bary = UniformTriangle(u, v);
-    const Vec3d q = corner[0] + Vec3d(e.e1) * static_cast<double>(bary.x) +
-                    Vec3d(e.e2) * static_cast<double>(bary.y);
-    const double d2 = Length2(q), d = std::sqrt(d2);
-    if (!(d > 0)) return std::nullopt;
-    out.direction = Vec3f(q / d);
-    out.distance_m = static_cast<float>(d);
-    out.b1 = bary.x;
-    out.b2 = bary.y;
-    out.inverse_pdf_sr =
-        static_cast<float>(std::fabs(Dot(q, Vec3d(e.normal))) / (d * d2) * e.area_m2);
-    return out;
+  std::array<int64_t, kWidth> offset;
+  for (size_t k = 0; k < kWidth; ++k) {
+    offset[k] = static_cast<int64_t>(place[k] / kWidth * 14 * kWidth + place[k] % kWidth);
   }
+  return load([&](size_t field) { return Gather8(blocks + field * kWidth, offset); });
+}
+
+// By solid angle: bounded however near the emitter comes, where sampling by area has the unbounded
+// factor cosθ_l / d². Arvo's map ("Stratified Sampling of Spherical Triangles", 1995) in the form
+// of Peters 2021 ("BRDF Importance Sampling for Polygonal Lights", 4), which needs one arc tangent
+// and one sine and cosine, and holds in single precision.
+LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& samples) const {
+  const F8 zero = Set8(0.0f), one = Set8(1.0f), two = Set8(2.0f);
+  const F8 least = Set8(std::numeric_limits<float>::min());
+  const EmitterLanes e = LoadEmitters(samples.place);
+  const V8 to_a = e.a - samples.origin, to_b = e.b - samples.origin, to_c = e.c - samples.origin;
+  const F8 length_a = Sqrt8(Length2(to_a)), length_b = Sqrt8(Length2(to_b)),
+           length_c = Sqrt8(Length2(to_c));
+  const F8 height = Dot(to_a, e.normal);  // of the plane over the origin, signed
+  EmitterDirections out;
+  out.height_m = Abs8(height);
+  // Else at a corner, or in the triangle's plane: nothing arrives.
+  out.any = (length_a > zero) & (length_b > zero) & (length_c > zero) & (out.height_m > zero);
+  const V8 a = to_a * (one / Max8(length_a, least)), b = to_b * (one / Max8(length_b, least)),
+           c = to_c * (one / Max8(length_c, least));
+  // The solid angle by Van Oosterom and Strackee 1983, as in WeightOf.
+  const F8 ab = Dot(a, b), ca = Dot(c, a), ca_bc = ca + Dot(b, c);
+  const F8 triple =
+      (e.twice_area / Max8(length_a * length_b, least)) * (out.height_m / Max8(length_c, least));
+  const F8 half_angle = DetAtan2Upper8(triple, one + ab + ca_bc);
+  const F8 solid_angle = two * half_angle;
+
   // (u, v) = (., 0), (0, 1), (1, 1) become b, a, c below: the corners' cosines make a bilinear
   // density over the square that is near to the cosine (Hart et al. 2020, "Practical Product
   // Sampling by Fitting and Composing Warps").
-  const Vec3d normal(n);
-  constexpr double kLeastCosine = 0.01;
-  const double cos_a = std::max(Dot(normal, a), kLeastCosine);
-  const double cos_b = std::max(Dot(normal, b), kLeastCosine);
-  const double cos_corner_c = std::max(Dot(normal, c), kLeastCosine);
-  double warp_pdf = 1.0;
-  const double warped_v = SampleLinear(v, 2.0 * cos_b, cos_a + cos_corner_c, warp_pdf);
-  const double warped_u = SampleLinear(u, cos_b + (cos_a - cos_b) * warped_v,
-                                       cos_b + (cos_corner_c - cos_b) * warped_v, warp_pdf);
-  // Interior angles at the corners, from the planes of the great circles.
-  const Vec3d n_ab = Cross(a, b), n_ca = Cross(c, a);
-  const auto angle = [](const Vec3d& m, const Vec3d& n) {
-    return DetAtan2(Length(Cross(m, n)), -Dot(m, n));
-  };
-  const double alpha = angle(n_ab, n_ca);
-  const double cos_alpha = DetSinCos(alpha).cos, sin_alpha = DetSinCos(alpha).sin;
-  const double cos_c = Dot(a, b);  // arc opposite to corner c
-  // The sub-triangle of area u Ω: its third corner lies on the arc from a to c.
-  const SinCos phi = DetSinCos(warped_u * solid_angle - alpha);
-  const double uu = phi.cos - cos_alpha;
-  const double vv = phi.sin + sin_alpha * cos_c;
-  const double denominator = (vv * phi.sin + uu * phi.cos) * sin_alpha;
-  const double q =
-      denominator != 0.0
-          ? std::clamp(((vv * phi.cos - uu * phi.sin) * cos_alpha - vv) / denominator, -1.0, 1.0)
-          : 1.0;
-  const Vec3d toward_c = NormalizeOr(c - a * Dot(c, a), a);
-  const Vec3d c_hat = a * q + toward_c * std::sqrt(std::max(0.0, 1.0 - q * q));
-  const double z = 1.0 - warped_v * (1.0 - Dot(c_hat, b));
-  const Vec3d w = Normalize(b * z + NormalizeOr(c_hat - b * Dot(c_hat, b), c_hat) *
-                                        std::sqrt(std::max(0.0, 1.0 - z * z)));
-  // Where the direction meets the triangle's plane.
-  const double cos_l = Dot(w, Vec3d(e.normal));
-  if (!(cos_l * height > 0.0)) return std::nullopt;
-  const double distance = height / cos_l;
-  const Vec3d at = w * distance - corner[0];
-  const Vec3d e1(e.e1), e2(e.e2);
-  const double d11 = Dot(e1, e1), d12 = Dot(e1, e2), d22 = Dot(e2, e2);
-  const double det = d11 * d22 - d12 * d12;
-  if (!(det > 0.0)) return std::nullopt;
-  out.b1 = static_cast<float>(std::clamp((Dot(at, e1) * d22 - Dot(at, e2) * d12) / det, 0.0, 1.0));
-  out.b2 = static_cast<float>(std::clamp((Dot(at, e2) * d11 - Dot(at, e1) * d12) / det, 0.0, 1.0));
-  out.direction = Vec3f(w);
-  out.distance_m = static_cast<float>(distance);
-  out.inverse_pdf_sr = static_cast<float>(solid_angle / warp_pdf);
+  const F8 least_cosine = Set8(0.01f);
+  const F8 cos_a = Max8(Dot(samples.n, a), least_cosine);
+  const F8 cos_b = Max8(Dot(samples.n, b), least_cosine);
+  const F8 cos_c = Max8(Dot(samples.n, c), least_cosine);
+  F8 warp_pdf = one;
+  const F8 v = SampleLinear(samples.v, two * cos_b, cos_a + cos_c, warp_pdf);
+  const F8 u =
+      SampleLinear(samples.u, cos_b + (cos_a - cos_b) * v, cos_b + (cos_c - cos_b) * v, warp_pdf);
+  // The sub-triangle of area u Ω: its third corner d lies on the arc from a to c, where a is
+  // mirrored at `middle`.
+  const SinCos8 part = DetSinCos8(u * half_angle);
+  const V8 middle = a * (triple * part.cos - ca_bc * part.sin) + c * ((one + ab) * part.sin);
+  const V8 d = middle * (two * Dot(a, middle) / Max8(Dot(middle, middle), least)) - a;
+  // On the arc from b to d, by the height over b: cos = 1 - v (1 - cos of the whole arc). Near to
+  // b and near to -b, d is told by its difference.
+  const V8 sum = d + b, difference = d - b;
+  const F8 below = Set8(0.5f) * Length2(difference), above = Set8(0.5f) * Length2(sum);
+  const V8 base = Select8(below < above, difference, sum);
+  const V8 aside = base - b * Dot(b, base);
+  const F8 sin2 = v * below * (two * (one - v) + v * above);
+  const V8 w =
+      Normalize(b * (one - v * below) + aside * (Sqrt8(sin2) / Sqrt8(Max8(Length2(aside), least))));
+  const F8 cos_l = Dot(w, e.normal);
+  out.any &= cos_l * height > zero;
+  out.direction = w;
+  out.distance_m = height / cos_l;
+  out.inverse_pdf_sr = solid_angle / warp_pdf;
+
+  const M8 small = solid_angle <= Set8(kSmallSolidAngle);
+  if (Bits8(small & out.any) == 0) return out;
+  F8 b1 = samples.u, b2 = samples.v;
+  UniformTriangle8(b1, b2);
+  const V8 q = to_a + (e.b - e.a) * b1 + (e.c - e.a) * b2;
+  const F8 q2 = Length2(q), distance = Sqrt8(q2);
+  out.direction = Select8(small, q / distance, out.direction);
+  out.distance_m = Select8(small, distance, out.distance_m);
+  out.inverse_pdf_sr = Select8(small, (out.height_m / distance) * (Set8(0.5f) * e.twice_area / q2),
+                               out.inverse_pdf_sr);
   return out;
 }
 
@@ -160,6 +188,7 @@ void LightSampler::AddEmitters() {
     e.e2 = scene.vertices()[scene.triangles()[t].vertex[2]] - e.v0;
     e.normal = scene.GeometricNormal(t);
     e.area_m2 = scene.TriangleArea(t);
+    e.radiance = material.emission;
     e.varies = material.emission_texture >= 0 || material.alpha_cutoff >= 0.0f;
     found.push_back(e);
     luminance.push_back(mean);
@@ -256,33 +285,22 @@ void LightSampler::AddPunctualLights() {
 // nothing is in the way. The solid angle by Van Oosterom and Strackee 1983,
 //   tan(Ω/2) = a·(b × c) / (|a||b||c| + a·b |c| + b·c |a| + c·a |b|),
 // the arc tangent to 0.5 %. It is 0 only if the triangle lies below the horizon or is seen edge-on.
-void LightSampler::Weigh(const EmitterBlock& block, const Vec3f& p, const Vec3f& n,
-                         LightTree::Weights& weights) {
+F8 LightSampler::WeightOf(const EmitterLanes& e, const V8& p, const V8& n) {
   const F8 zero = Set8(0), one = Set8(1), least = Set8(std::numeric_limits<float>::min());
-  struct V8 {
-    F8 x, y, z;
-    F8 Dot(const V8& o) const { return x * o.x + y * o.y + z * o.z; }
-  };
-  const auto load = [](const LightTree::Weights(&v)[3]) {
-    return V8{Load8(v[0].data()), Load8(v[1].data()), Load8(v[2].data())};
-  };
-  const auto unit = [&](const LightTree::Weights(&v)[3], V8& direction, F8& length) {
-    const V8 to{Load8(v[0].data()) - Set8(p.x), Load8(v[1].data()) - Set8(p.y),
-                Load8(v[2].data()) - Set8(p.z)};
-    length = Sqrt8(to.Dot(to));
-    const F8 inverse = one / Max8(length, least);
-    direction = {to.x * inverse, to.y * inverse, to.z * inverse};
+  const auto unit = [&](const V8& corner, V8& direction, F8& length) {
+    const V8 to = corner - p;
+    length = Sqrt8(Length2(to));
+    direction = to * (one / Max8(length, least));
     return to;
   };
   V8 a, b, c;
   F8 length_a, length_b, length_c;
-  const V8 to_a = unit(block.a, a, length_a);
-  unit(block.b, b, length_b);
-  unit(block.c, c, length_c);
-  const F8 height = Abs8(to_a.Dot(load(block.normal)));
-  const F8 y = (Load8(block.twice_area.data()) / Max8(length_a * length_b, least)) *
-               (height / Max8(length_c, least));
-  const F8 x = one + a.Dot(b) + b.Dot(c) + c.Dot(a);
+  const V8 to_a = unit(e.a, a, length_a);
+  unit(e.b, b, length_b);
+  unit(e.c, c, length_c);
+  const F8 height = Abs8(Dot(to_a, e.normal));
+  const F8 y = (e.twice_area / Max8(length_a * length_b, least)) * (height / Max8(length_c, least));
+  const F8 x = one + Dot(a, b) + Dot(b, c) + Dot(c, a);
   // atan2(y, x), y >= 0, by the smaller quotient of the two.
   const F8 abs_x = Abs8(x);
   const F8 low = Min8(abs_x, y), high = Max8(abs_x, y);
@@ -290,11 +308,22 @@ void LightSampler::Weigh(const EmitterBlock& block, const Vec3f& p, const Vec3f&
   F8 angle = q / (one + Set8(0.28f) * q * q);
   angle = Select8(y > abs_x, Set8(0.5f * kPif) - angle, angle);
   angle = Select8(x < zero, Set8(kPif) - angle, angle);
-  const V8 normal{Set8(n.x), Set8(n.y), Set8(n.z)};
-  const F8 cosines =
-      Max8(a.Dot(normal), zero) + Max8(b.Dot(normal), zero) + Max8(c.Dot(normal), zero);
-  const F8 weight = Load8(block.luminance.data()) * angle * cosines;
-  Store8(weights.data(), Min8(Max8(weight, zero), Set8(1e30f)));
+  const F8 cosines = Max8(Dot(a, n), zero) + Max8(Dot(b, n), zero) + Max8(Dot(c, n), zero);
+  return Min8(Max8(e.luminance * angle * cosines, zero), Set8(1e30f));
+}
+
+void LightSampler::Weigh(const EmitterBlock& block, const Vec3f& p, const Vec3f& n,
+                         LightTree::Weights& weights) {
+  const auto load = [](const LightTree::Weights(&v)[3]) {
+    return V8(Load8(v[0].data()), Load8(v[1].data()), Load8(v[2].data()));
+  };
+  const EmitterLanes lanes{load(block.a),
+                           load(block.b),
+                           load(block.c),
+                           load(block.normal),
+                           Load8(block.twice_area.data()),
+                           Load8(block.luminance.data())};
+  Store8(weights.data(), WeightOf(lanes, V8(p), V8(n)));
 }
 
 // The irradiance that arrives if nothing is in the way.
@@ -322,26 +351,37 @@ void LightSampler::Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f
   Store8(weights.data(), Select8(d2 > zero, Min8(Max8(weight, zero), Set8(1e30f)), zero));
 }
 
+V8 LightSampler::Irradiance8(const SurfacePoints8& points, uint64_t key, unsigned dimension,
+                             LightCounters& counters) const {
+  const V8 origin = points.p + points.ng * Set8(accel_->surface_offset_m());
+  V8 irradiance{Vec3f()};
+  if (!directional_lights_.empty() || !positioned_lights_.empty()) {
+    for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
+      const auto k = static_cast<size_t>(std::countr_zero(rest));
+      const Query q{points.p.Lane(k), points.ng.Lane(k), points.n.Lane(k), origin.Lane(k), 1, key,
+                    points.index[k],  dimension};
+      irradiance.SetLane(k, FromAllPunctual(q, counters));
+    }
+  }
+  if (!emitters_.empty()) {
+    irradiance = irradiance + FromEmitters(points, origin, key, dimension, counters);
+  }
+  if (!has_sky_) return irradiance;
+  for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
+    const auto k = static_cast<size_t>(std::countr_zero(rest));
+    const Query q{points.p.Lane(k), points.ng.Lane(k), points.n.Lane(k), origin.Lane(k), 1, key,
+                  points.index[k],  dimension};
+    irradiance.SetLane(k, irradiance.Lane(k) + (environment_ != nullptr ? FromMap(q, counters)
+                                                                        : FromSky(q, counters)));
+  }
+  return irradiance;
+}
+
 Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
                              uint64_t key, uint32_t first_index, unsigned dimension,
                              LightCounters& counters, bool refine) const {
   const Query q{p, ng, n, accel_->LeaveSurface(p, ng), samples, key, first_index, dimension};
-  Rgb irradiance;
-  const uint32_t few = std::max(samples, kFewLights);
-  if (directional_lights_.size() <= few) {
-    for (const PreparedLight& light : directional_lights_) {
-      irradiance += FromPunctual(light, q, counters);
-    }
-  } else {
-    irradiance += FromManyDirectional(q, counters);
-  }
-  if (positioned_count_ <= few) {
-    for (const PreparedLight& light : positioned_lights_) {
-      if (MaxComponent(light.intensity) > 0.0f) irradiance += FromPunctual(light, q, counters);
-    }
-  } else {
-    irradiance += FromPunctualLights(q, counters);
-  }
+  Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
     irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
   }
@@ -380,6 +420,26 @@ Rgb LightSampler::Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&
     sum += mean[i] * (static_cast<float>(half[i].samples) / static_cast<float>(q.samples));
   }
   return sum;
+}
+
+Rgb LightSampler::FromAllPunctual(const Query& q, LightCounters& counters) const {
+  const uint32_t few = std::max(q.samples, kFewLights);
+  Rgb irradiance;
+  if (directional_lights_.size() <= few) {
+    for (const PreparedLight& light : directional_lights_) {
+      irradiance += FromPunctual(light, q, counters);
+    }
+  } else {
+    irradiance += FromManyDirectional(q, counters);
+  }
+  if (positioned_count_ <= few) {
+    for (const PreparedLight& light : positioned_lights_) {
+      if (MaxComponent(light.intensity) > 0.0f) irradiance += FromPunctual(light, q, counters);
+    }
+  } else {
+    irradiance += FromPunctualLights(q, counters);
+  }
+  return irradiance;
 }
 
 Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
@@ -474,52 +534,125 @@ Rgb LightSampler::FromManyDirectional(const Query& q, LightCounters& counters) c
 }
 
 Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
-  const PreparedScene& scene = accel_->scene();
   const uint32_t seed = static_cast<uint32_t>(HashKey(q.key, 1));
+  const OwenSobolAxis axis_u(q.dimension, seed), axis_v(q.dimension + 1, seed);
   LightTree::Cache cache;
+  const auto weigh = [&](uint32_t block, LightTree::Weights& weights) {
+    Weigh(emitter_blocks_[block], q.origin, q.n, weights);
+  };
+  EmitterSamples samples;
+  samples.origin = V8(q.origin);
+  samples.n = V8(q.n);
+  samples.ng = V8(q.ng);
+  const U8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
   Rgb sum;
-  for (uint32_t i = 0; i < q.samples; ++i) {
-    double u = OwenSobolBits(q.first_index + i, q.dimension, seed) * 0x1p-32;
-    const float v = OwenSobol(q.first_index + i, q.dimension + 1, seed);
-    ++counters.samples;
-    const auto choice = emitter_tree_.Choose(
-        q.origin, q.n, u, cache, [&](uint32_t block, LightTree::Weights& weights) {
-          Weigh(emitter_blocks_[block], q.origin, q.n, weights);
-        });
-    if (!choice) {
-      ++counters.skipped_facing_away;
-      continue;
+  for (uint32_t first = 0; first < q.samples; first += LightTree::kWidth) {
+    const U8 index = lanes + (q.first_index + first);
+    const U8 bits = axis_u.BitsOf(index);
+    samples.v = axis_v.PointsOf(index);
+    samples.active = 0;
+    const uint32_t count = std::min(q.samples - first, LightTree::kWidth);
+    for (uint32_t k = 0; k < count; ++k) {
+      double u = bits[k] * 0x1p-32;
+      samples.Set(k, u, emitter_tree_.Choose(q.origin, q.n, u, cache, weigh));
     }
-    const Emitter& e = emitters_[choice->place];
-    const std::optional<EmitterPoint> point =
-        SamplePoint(e, q.origin, q.n, std::min(static_cast<float>(u), 0.99999994f), v);
-    if (!point || !(Dot(q.n, point->direction) > 0.0f) || !(Dot(q.ng, point->direction) > 0.0f)) {
-      ++counters.skipped_facing_away;
-      continue;
+    counters.samples += count;
+    counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(samples.active));
+    const V8 part = FromEmitters8(samples, counters);
+    for (uint32_t k = 0; k < count; ++k) sum += part.Lane(k);
+  }
+  return sum / static_cast<float>(q.samples);
+}
+
+V8 LightSampler::FromEmitters(const SurfacePoints8& points, const V8& origin, uint64_t key,
+                              unsigned dimension, LightCounters& counters) const {
+  const uint32_t seed = static_cast<uint32_t>(HashKey(key, 1));
+  const U8 bits = OwenSobolAxis(dimension, seed).BitsOf(points.index);
+  EmitterSamples samples;
+  samples.origin = origin;
+  samples.n = points.n;
+  samples.ng = points.ng;
+  samples.v = OwenSobolAxis(dimension + 1, seed).PointsOf(points.index);
+  if (emitter_tree_.is_one_block()) {
+    // One emitter after the other for all points.
+    std::array<F8, LightTree::kWidth> weights{};
+    for (uint32_t place = 0; place < LightTree::kWidth; ++place) {
+      if (!(emitters_[place].area_m2 > 0.0f)) continue;
+      weights[place] = WeightOf(LoadEmitters(U8{} + place), origin, points.n);
     }
-    const PreparedMaterial& material = scene.MaterialOf(e.triangle);
-    Rgb radiance = material.emission;
+    const LightTree::Choices8 choices = LightTree::ChooseInBlock8(weights, bits);
+    samples.place = choices.place;
+    samples.probability = choices.probability;
+    samples.u = Min8(choices.u, Set8(kBelowOne));
+    samples.active = points.active & Bits8(choices.any);
+  } else {
+    for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
+      const auto k = static_cast<uint32_t>(std::countr_zero(rest));
+      double u = bits[k] * 0x1p-32;
+      const Vec3f p = origin.Lane(k), n = points.n.Lane(k);
+      LightTree::Cache cache;
+      samples.Set(
+          k, u,
+          emitter_tree_.Choose(p, n, u, cache, [&](uint32_t block, LightTree::Weights& weights) {
+            Weigh(emitter_blocks_[block], p, n, weights);
+          }));
+    }
+  }
+  const auto count = static_cast<uint32_t>(std::popcount(points.active));
+  counters.samples += count;
+  counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(samples.active));
+  return FromEmitters8(samples, counters);
+}
+
+V8 LightSampler::FromEmitters8(const EmitterSamples& samples, LightCounters& counters) const {
+  const PreparedScene& scene = accel_->scene();
+  V8 sum{Vec3f()};
+  if (samples.active == 0) return sum;
+  const EmitterDirections to = Directions(samples);
+  const F8 zero = Set8(0.0f);
+  const F8 cosine = Dot(samples.n, to.direction);
+  const unsigned arriving =
+      samples.active & Bits8(to.any & (cosine > zero) & (Dot(samples.ng, to.direction) > zero));
+  counters.skipped_facing_away += static_cast<uint32_t>(std::popcount(samples.active ^ arriving));
+  // Up to two surface offsets over the emitter's plane, not along the ray: a grazing ray would
+  // hit the emitter itself.
+  const F8 reach_m =
+      to.distance_m * (Set8(1.0f) - Set8(2.0f * accel_->surface_offset_m()) / to.height_m);
+  const F8 weight = cosine * to.inverse_pdf_sr / samples.probability;
+  for (unsigned rest = arriving; rest != 0; rest &= rest - 1) {
+    const auto k = static_cast<size_t>(std::countr_zero(rest));
+    const Emitter& e = emitters_[samples.place[k]];
+    const Vec3f origin = samples.origin.Lane(k), direction = to.direction.Lane(k);
+    Rgb radiance = e.radiance;
     if (e.varies) {
-      const SurfaceSample surface = scene.Surface(e.triangle, point->b1, point->b2);
-      radiance = surface.alpha < material.alpha_cutoff ? Rgb() : surface.emission;
+      radiance = e.RadianceAt(scene, origin + direction * to.distance_m[k]);
       if (!(MaxComponent(radiance) > 0.0f)) {  // black, or a hole of an alpha mask
         ++counters.skipped_facing_away;
         continue;
       }
     }
-    // Up to two surface offsets over the emitter's plane, not along the ray: a grazing ray would
-    // hit the emitter itself.
-    const float reach_m =
-        point->distance_m * (1.0f - 2.0f * accel_->surface_offset_m() / point->height_m);
     ++counters.rays;
-    if (reach_m > 0.0f && accel_->Occluded(q.origin, point->direction, reach_m)) {
+    if (reach_m[k] > 0.0f && accel_->Occluded(origin, direction, reach_m[k])) {
       ++counters.blocked;
       continue;
     }
-    sum += radiance * (Dot(q.n, point->direction) * point->inverse_pdf_sr /
-                       static_cast<float>(choice->probability));
+    sum.SetLane(k, radiance * weight[k]);
   }
-  return sum / static_cast<float>(q.samples);
+  return sum;
+}
+
+// The radiance at the point of a textured or holed emitter that is nearest to `q`.
+Rgb LightSampler::Emitter::RadianceAt(const PreparedScene& scene, const Vec3f& q) const {
+  const Vec3d at = Vec3d(q) - Vec3d(v0), along1(e1), along2(e2);
+  const double d11 = Dot(along1, along1), d12 = Dot(along1, along2), d22 = Dot(along2, along2);
+  const double a1 = Dot(at, along1), a2 = Dot(at, along2);
+  const double determinant = d11 * d22 - d12 * d12;
+  if (!(determinant > 0.0)) return {};
+  const double b1 = std::clamp((a1 * d22 - a2 * d12) / determinant, 0.0, 1.0);
+  const double b2 = std::clamp((a2 * d11 - a1 * d12) / determinant, 0.0, 1.0);
+  const SurfaceSample surface =
+      scene.Surface(triangle, static_cast<float>(b1), static_cast<float>(b2));
+  return surface.alpha < scene.MaterialOf(triangle).alpha_cutoff ? Rgb() : surface.emission;
 }
 
 Rgb LightSampler::FromSky(const Query& q, LightCounters& counters) const {

@@ -18,6 +18,7 @@
 #include <span>
 #include <vector>
 
+#include "core/math/simd8.h"
 #include "core/math/vec.h"
 
 namespace farpoint {
@@ -76,6 +77,17 @@ class LightTree {
   template <typename BlockWeights>
   std::optional<Choice> Choose(const Vec3f& p, const Vec3f& n, double& u, Cache& cache,
                                const BlockWeights& block_weights) const;
+  // True of up to eight lights: Choose is then ChooseInBlock of the weights of block 0.
+  bool is_one_block() const { return root_ == kBlock; }
+  static std::optional<Choice> ChooseInBlock(const Weights& weights, double& u);
+  // The same for eight points at once, to the same bits.
+  struct Choices8 {
+    U8 place;
+    F8 probability, u;
+    M8 any;
+  };
+  // weights[i]: of light i, for each point; `u` in 2^-32.
+  static Choices8 ChooseInBlock8(const std::array<F8, kWidth>& weights, const U8& u);
 
  private:
   struct alignas(32) Node {
@@ -103,11 +115,36 @@ class LightTree {
   std::vector<uint32_t> order_;
 };
 
+inline std::optional<LightTree::Choice> LightTree::ChooseInBlock(const Weights& weights,
+                                                                 double& u) {
+  constexpr double kBelowOne = 1.0 - 0x1p-53;
+  double total = 0;
+  uint32_t positive = 0;
+  for (const float w : weights) {
+    total += static_cast<double>(w);
+    positive += w > 0 ? 1u : 0u;
+  }
+  if (!(total > 0)) return std::nullopt;
+  // Side by side in [0, 1).
+  uint32_t chosen = 0;
+  double sum = 0, before = 0, below = 0;
+  for (uint32_t k = 0; k < kWidth; ++k) {
+    if (!(weights[k] > 0)) continue;
+    chosen = k;
+    sum += static_cast<double>(weights[k]);
+    before = below;
+    below = sum / total;
+    if (positive == 2 && sum < total) below = AtAnEighth(below);
+    if (u < below) break;
+  }
+  u = std::clamp((u - before) / (below - before), 0.0, kBelowOne);
+  return Choice{chosen, below - before};
+}
+
 template <typename BlockWeights>
 std::optional<LightTree::Choice> LightTree::Choose(const Vec3f& p, const Vec3f& n, double& u,
                                                    Cache& cache,
                                                    const BlockWeights& block_weights) const {
-  constexpr double kBelowOne = 1.0 - 0x1p-53;
   double probability = 1;
   uint32_t at = root_;
   if (at == kNone) return std::nullopt;
@@ -137,29 +174,11 @@ std::optional<LightTree::Choice> LightTree::Choose(const Vec3f& p, const Vec3f& 
         }
       }
     }
-    double total = 0;
-    uint32_t positive = 0;
-    for (const float w : weight) {
-      total += static_cast<double>(w);
-      positive += w > 0 ? 1u : 0u;
-    }
-    if (!(total > 0)) return std::nullopt;
-    // The children side by side in [0, 1).
-    uint32_t chosen = 0;
-    double sum = 0, before = 0, below = 0;
-    for (uint32_t k = 0; k < kWidth; ++k) {
-      if (!(weight[k] > 0)) continue;
-      chosen = k;
-      sum += static_cast<double>(weight[k]);
-      before = below;
-      below = sum / total;
-      if (positive == 2 && sum < total) below = AtAnEighth(below);
-      if (u < below) break;
-    }
-    u = std::clamp((u - before) / (below - before), 0.0, kBelowOne);
-    probability *= below - before;
-    if (is_block) return Choice{index * kWidth + chosen, probability};
-    at = nodes_[index].child[chosen];
+    const std::optional<Choice> step = ChooseInBlock(weight, u);
+    if (!step) return std::nullopt;
+    probability *= step->probability;
+    if (is_block) return Choice{index * kWidth + step->place, probability};
+    at = nodes_[index].child[step->place];
   }
 }
 

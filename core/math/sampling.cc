@@ -4,16 +4,26 @@
 #include <array>
 
 #include "core/math/elementary.h"
+#include "core/math/elementary8.h"
 
 namespace farpoint {
 
 namespace {
 
-constexpr uint32_t ReverseBits(uint32_t x) {
+uint32_t SwapBytes(uint32_t x) { return __builtin_bswap32(x); }
+U8 SwapBytes(const U8& x) {
+  const __m256i order = _mm256_set_epi8(12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3,  //
+                                        12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3);
+  return reinterpret_cast<U8>(_mm256_shuffle_epi8(reinterpret_cast<__m256i>(x), order));
+}
+
+// Bits is uint32_t or U8.
+template <typename Bits>
+Bits ReverseBits(Bits x) {
   x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
   x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
   x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
-  return __builtin_bswap32(x);
+  return SwapBytes(x);
 }
 
 // Generator matrices of dimensions 0 to 3, from the primitive polynomials and initial direction
@@ -58,7 +68,8 @@ constexpr std::array<std::array<std::array<uint32_t, 256>, 4>, 4> MakeByteTables
 constexpr auto kByteTables = MakeByteTables();
 
 // Permutes the bits of x from the lowest up, each depending on those below it only.
-constexpr uint32_t LaineKarrasPermutation(uint32_t x, uint32_t seed) {
+template <typename Bits>
+Bits LaineKarrasPermutation(Bits x, uint32_t seed) {
   x ^= x * 0x3d20adeau;
   x += seed;
   x *= (seed >> 16) | 1u;
@@ -67,7 +78,8 @@ constexpr uint32_t LaineKarrasPermutation(uint32_t x, uint32_t seed) {
   return x;
 }
 
-constexpr uint32_t NestedUniformScramble(uint32_t x, uint32_t seed) {
+template <typename Bits>
+Bits NestedUniformScramble(const Bits& x, uint32_t seed) {
   return ReverseBits(LaineKarrasPermutation(ReverseBits(x), seed));
 }
 
@@ -78,6 +90,19 @@ uint32_t OwenSobolBits(uint32_t index, unsigned dimension, uint32_t seed) {
   uint32_t x = table[0][index & 0xffu];
   for (uint32_t i = index >> 8, byte = 1; i != 0; i >>= 8, ++byte) x ^= table[byte][i & 0xffu];
   return NestedUniformScramble(x, static_cast<uint32_t>(HashKey(seed, dimension)));
+}
+
+U8 OwenSobolAxis::BitsOf(const U8& index) const {
+  const auto& table = kByteTables[dimension_];
+  const auto look_up = [&](size_t byte) {
+    return reinterpret_cast<U8>(_mm256_i32gather_epi32(
+        reinterpret_cast<const int*>(table[byte].data()),
+        reinterpret_cast<__m256i>((index >> (8 * static_cast<uint32_t>(byte))) & 0xffu),
+        sizeof(uint32_t)));
+  };
+  U8 x = look_up(0);
+  if (Bits8(reinterpret_cast<M8>(index > 0xffu)) != 0) x ^= look_up(1) ^ look_up(2) ^ look_up(3);
+  return NestedUniformScramble(x, scramble_);
 }
 
 uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed) {
@@ -103,6 +128,18 @@ Vec2f ConcentricDisc(float u, float v) {
 Vec3f CosineHemisphere(float u, float v) {
   const Vec2f d = ConcentricDisc(u, v);
   return {d.x, d.y, std::sqrt(std::max(0.0f, 1.0f - d.x * d.x - d.y * d.y))};
+}
+
+V8 CosineHemisphere8(F8 u, F8 v) {
+  const F8 one = Set8(1.0f), two = Set8(2.0f);
+  const F8 a = two * u - one, b = two * v - one;
+  // The angle is counted from the axis that is nearer, so it never exceeds an eighth of a turn.
+  const M8 along_a = Abs8(a) > Abs8(b);
+  const F8 r = Select8(along_a, a, b), other = Select8(along_a, b, a);
+  const F8 quotient = Select8(r == Set8(0.0f), r, other / r);
+  const SinCos8 sc = DetSinCosEighth8(Set8(0.78539816339744831f) * quotient);
+  const F8 near = r * sc.cos, far = r * sc.sin;
+  return {Select8(along_a, near, far), Select8(along_a, far, near), Sqrt8(one - r * r)};
 }
 
 Vec3f UniformSphere(float u, float v) {

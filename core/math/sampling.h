@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "core/math/vec.h"
+#include "core/math/vec8.h"
 
 namespace farpoint {
 
@@ -35,6 +36,22 @@ uint32_t OwenSobolBits(uint32_t index, unsigned dimension, uint32_t seed);
 inline float OwenSobol(uint32_t index, unsigned dimension, uint32_t seed) {
   return ToUnitFloat(OwenSobolBits(index, dimension, seed));
 }
+// One dimension under one seed, for many points: the same bits.
+class OwenSobolAxis {
+ public:
+  OwenSobolAxis(unsigned dimension, uint32_t seed)
+      : dimension_(dimension), scramble_(static_cast<uint32_t>(HashKey(seed, dimension))) {}
+  U8 BitsOf(const U8& index) const;
+  // As OwenSobol.
+  F8 PointsOf(const U8& index) const {
+    return __builtin_convertvector(reinterpret_cast<M8>(BitsOf(index) >> 8), F8) *
+           Set8(1.0f / 16777216.0f);
+  }
+
+ private:
+  unsigned dimension_;
+  uint32_t scramble_;
+};
 // Visits [0, 2^32) in an order shuffled by `seed` such that aligned blocks of 2^k stay together.
 uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed);
 
@@ -42,6 +59,8 @@ uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed);
 Vec2f ConcentricDisc(float u, float v);
 // u, v in [0, 1) -> hemisphere about +z. pdf_sr = cos(theta) / pi.
 Vec3f CosineHemisphere(float u, float v);
+// The same in eight lanes and in single precision; components differ by less than 4e-7.
+V8 CosineHemisphere8(F8 u, F8 v);
 // u, v in [0, 1) -> the whole sphere. pdf_sr = 1 / (4 pi).
 Vec3f UniformSphere(float u, float v);
 // u, v in [0, 1) -> barycentric weights of vertices 1 and 2 of a triangle (Heitz 2019, low

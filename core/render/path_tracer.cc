@@ -3,79 +3,190 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <optional>
 
-#include "core/math/elementary.h"
 #include "core/math/sampling.h"
+#include "core/math/simd4d.h"
+#include "core/math/vec8.h"
 
 namespace farpoint {
 
 namespace {
+
 constexpr uint32_t kBatches = 8;
+// Directions, rays and light by turns of so many paths: what follows each other does the same work,
+// and eight lanes are full.
+constexpr uint32_t kTurn = 64;
+constexpr uint32_t kWidth = 8;
+
+// As PreparedScene::GeometricNormal, to the same bits: in double, rounded once.
+V8 GeometricNormals(const V8& a, const V8& b, const V8& c) {
+  D4 n[3][2];
+  for (int h = 0; h < 2; ++h) {
+    const D4 ax = Half4(a.x, h), ay = Half4(a.y, h), az = Half4(a.z, h);
+    const D4 ux = Half4(b.x, h) - ax, uy = Half4(b.y, h) - ay, uz = Half4(b.z, h) - az;
+    const D4 vx = Half4(c.x, h) - ax, vy = Half4(c.y, h) - ay, vz = Half4(c.z, h) - az;
+    const D4 x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
+    const D4 m = Max4(Max4(Abs4(x), Abs4(y)), Abs4(z));
+    const D4 sx = x / m, sy = y / m, sz = z / m;
+    const D4 length = Sqrt4(sx * sx + sy * sy + sz * sz);
+    n[0][h] = sx / length;
+    n[1][h] = sy / length;
+    n[2][h] = sz / length;
+  }
+  return {Join8(n[0][0], n[0][1]), Join8(n[1][0], n[1][1]), Join8(n[2][0], n[2][1])};
 }
+
+// Paths of a turn that have hit what may reflect, side by side.
+struct Hits {
+  using Row = std::array<float, kTurn>;
+  struct Rows {
+    alignas(32) Row x, y, z;
+    void Set(size_t i, const Vec3f& v) {
+      x[i] = v.x;
+      y[i] = v.y;
+      z[i] = v.z;
+    }
+    V8 Load(size_t i) const { return {Load8(&x[i]), Load8(&y[i]), Load8(&z[i])}; }
+  };
+  Rows direction, vertex[3], normal[3];
+  alignas(32) Row b1, b2, flat;  // flat: 1 where the mesh has no normals
+  std::array<uint32_t, kTurn> path, triangle;
+  uint32_t count = 0;
+};
+
+// Corners and normals of the hits; those on what is black without a look at its texture are taken
+// out.
+void KeepWhatReflects(const PreparedScene& scene, Hits& hits) {
+  uint32_t kept = 0;
+  for (uint32_t i = 0; i < hits.count; ++i) {
+    const uint32_t t = hits.triangle[i];
+    const PreparedTriangle& triangle = scene.triangles()[t];
+    const PreparedObject& object = scene.objects()[triangle.object];
+    if (!(MaxComponent(scene.materials()[object.material].base_color) > 0.0f)) continue;
+    const bool flat = object.has_normals == 0;
+    const uint32_t k = kept++;
+    hits.path[k] = hits.path[i];
+    hits.triangle[k] = t;
+    hits.b1[k] = hits.b1[i];
+    hits.b2[k] = hits.b2[i];
+    hits.direction.x[k] = hits.direction.x[i];
+    hits.direction.y[k] = hits.direction.y[i];
+    hits.direction.z[k] = hits.direction.z[i];
+    hits.flat[k] = flat ? 1.0f : 0.0f;
+    for (size_t c = 0; c < 3; ++c) {
+      hits.vertex[c].Set(k, scene.vertices()[triangle.vertex[c]]);
+      if (!flat) hits.normal[c].Set(k, scene.normals()[triangle.vertex[c]]);
+    }
+  }
+  hits.count = kept;
+}
+
+// Where eight paths have hit, with normals on the side that they came from: to the same bits as
+// PreparedScene gives them.
+SurfacePoints8 SurfaceAt(const Hits& hits, size_t i) {
+  const F8 zero = Set8(0.0f), one = Set8(1.0f);
+  const F8 b1 = Load8(&hits.b1[i]), b2 = Load8(&hits.b2[i]);
+  const V8 a = hits.vertex[0].Load(i), b = hits.vertex[1].Load(i), c = hits.vertex[2].Load(i);
+  SurfacePoints8 points;
+  points.p = a + (b - a) * b1 + (c - a) * b2;
+  points.ng = GeometricNormals(a, b, c);
+  points.n = points.ng;
+  const M8 flat = Load8(&hits.flat[i]) > zero;
+  if (Bits8(flat) != 0xffu) {
+    const V8 n = NormalizeOr(hits.normal[0].Load(i) * (one - b1 - b2) +
+                                 hits.normal[1].Load(i) * b1 + hits.normal[2].Load(i) * b2,
+                             points.ng);
+    points.n = Select8(flat, points.ng, Select8(Dot(n, points.ng) < zero, -n, n));
+  }
+  const M8 behind = Dot(points.ng, hits.direction.Load(i)) > zero;
+  points.ng = Select8(behind, -points.ng, points.ng);
+  points.n = Select8(behind, -points.n, points.n);
+  std::memcpy(&points.index, &hits.path[i], sizeof(points.index));
+  return points;
+}
+
+// The paths of batch b are FirstOf(b) up to FirstOf(b + 1).
+uint32_t FirstOf(uint32_t batch, uint32_t paths) {
+  return static_cast<uint32_t>((uint64_t{batch} * paths + kBatches - 1) / kBatches);
+}
+
+}  // namespace
 
 TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights,
                                const Receiver& receiver, uint32_t paths, uint64_t key,
                                LightCounters& counters, uint64_t& rays) {
   const PreparedScene& scene = accel.scene();
-  const Frame frame(receiver.normal);
+  const Frame8 frame{V8(receiver.normal)};
+  const V8 ng(receiver.geometric_normal);
   const Vec3f origin = accel.LeaveSurface(receiver.position, receiver.geometric_normal);
-  const uint32_t seed = static_cast<uint32_t>(HashKey(key, 11));
+  const auto seed = static_cast<uint32_t>(HashKey(key, 11));
+  const OwenSobolAxis axis_u(0, seed), axis_v(1, seed);
   const uint64_t light_key = HashKey(key, 12);
-  Vec3d sum;
   Vec3d batch[kBatches];
-  uint32_t batch_count[kBatches] = {};
-  // Directions, rays and light by turns of a few paths: what follows each other does the same work,
-  // and a twentieth less time goes by on small scenes.
-  constexpr uint32_t kTurn = 32;
-  std::array<Vec3f, kTurn> directions;
-  std::array<std::optional<RayHit>, kTurn> hits;
+  uint32_t b = 0, next_batch = FirstOf(1, paths);
+  Hits hits{};
+  const U8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
   for (uint32_t first = 0; first < paths; first += kTurn) {
     const uint32_t count = std::min(kTurn, paths - first);
-    for (uint32_t k = 0; k < count; ++k) {
-      directions[k] = frame.ToWorld(
-          CosineHemisphere(OwenSobol(first + k, 0, seed), OwenSobol(first + k, 1, seed)));
-    }
-    for (uint32_t k = 0; k < count; ++k) {
-      hits[k].reset();
+    std::array<V8, kTurn / kWidth> directions;
+    std::array<unsigned, kTurn / kWidth> leaves;
+    for (uint32_t k = 0; k < count; k += kWidth) {
+      const U8 index = lanes + (first + k);
+      const V8 w = frame.ToWorld(CosineHemisphere8(axis_u.PointsOf(index), axis_v.PointsOf(index)));
+      directions[k / kWidth] = w;
       // Directions that the shading normal allows and the surface does not carry nothing.
-      if (!(Dot(directions[k], receiver.geometric_normal) > 0.0f)) continue;
-      ++rays;
-      hits[k] = accel.Intersect(origin, directions[k]);
+      leaves[k / kWidth] = Bits8(Dot(w, ng) > Set8(0.0f));
+      if (count - k < kWidth) leaves[k / kWidth] &= (1u << (count - k)) - 1u;
     }
+    hits.count = 0;
     for (uint32_t k = 0; k < count; ++k) {
-      const uint32_t i = first + k;
-      const uint32_t b = static_cast<uint32_t>(uint64_t{i} * kBatches / paths);
-      ++batch_count[b];
-      const std::optional<RayHit>& hit = hits[k];
+      if ((leaves[k / kWidth] >> (k % kWidth) & 1u) == 0) continue;
+      const Vec3f w = directions[k / kWidth].Lane(k % kWidth);
+      ++rays;
+      const std::optional<RayHit> hit = accel.Intersect(origin, w);
       if (!hit) continue;
-      const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
-      if (!(MaxComponent(surface.albedo) > 0.0f)) continue;
-      Vec3f ng = scene.GeometricNormal(hit->triangle);
-      Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2, ng);
-      if (Dot(ng, directions[k]) > 0.0f) {
-        ng = -ng;
-        ns = -ns;
+      const uint32_t i = hits.count++;
+      hits.path[i] = first + k;
+      hits.triangle[i] = hit->triangle;
+      hits.b1[i] = hit->b1;
+      hits.b2[i] = hit->b2;
+      hits.direction.Set(i, w);
+    }
+    KeepWhatReflects(scene, hits);
+    for (uint32_t i = 0; i < hits.count; i += kWidth) {
+      const uint32_t width = std::min(kWidth, hits.count - i);
+      SurfacePoints8 points = SurfaceAt(hits, i);
+      points.active = (1u << width) - 1u;
+      const V8 e = lights.Irradiance8(points, light_key, 2, counters);
+      for (uint32_t k = 0; k < width; ++k) {
+        const Rgb arriving = e.Lane(k);
+        // Textures are looked up where light arrives only.
+        if (!(MaxComponent(arriving) > 0.0f)) continue;
+        const uint32_t h = i + k;
+        while (hits.path[h] >= next_batch) next_batch = FirstOf(++b + 1, paths);
+        batch[b] +=
+            Vec3d(scene.Surface(hits.triangle[h], hits.b1[h], hits.b2[h]).albedo * arriving);
       }
-      const Vec3f y = scene.PointOn(hit->triangle, hit->b1, hit->b2);
-      const Rgb e = lights.Irradiance(y, ng, ns, 1, light_key, i, 2, counters);
-      const Vec3d radiance = Vec3d(surface.albedo * e) / kPi;
-      sum += radiance;
-      batch[b] += radiance;
     }
   }
   TracedIrradiance out;
+  Vec3d sum;
+  for (const Vec3d& b : batch) sum += b;
+  // Of albedo E: its mean is pi times that of the radiance.
   const Vec3d mean = sum / static_cast<double>(paths);
-  out.irradiance = Rgb(mean * kPi);
+  out.irradiance = Rgb(mean);
   if (paths >= kBatches) {
     Vec3d variance;
     for (uint32_t b = 0; b < kBatches; ++b) {
-      const Vec3d d = batch[b] / static_cast<double>(batch_count[b]) - mean;
+      const uint32_t size = FirstOf(b + 1, paths) - FirstOf(b, paths);
+      const Vec3d d = batch[b] / static_cast<double>(size) - mean;
       variance += d * d;
     }
     variance = variance / (kBatches * (kBatches - 1.0));
     out.standard_error =
-        Rgb(Vec3d(std::sqrt(variance.x), std::sqrt(variance.y), std::sqrt(variance.z)) * kPi);
+        Rgb(Vec3d(std::sqrt(variance.x), std::sqrt(variance.y), std::sqrt(variance.z)));
   }
   return out;
 }

@@ -323,7 +323,7 @@ TEST(RectangularEmitter, NearItIsSeenAsAHalfSpace) {
   Scene scene;
   AddQuad(scene, FloorQuad(1), Emitting(2));
   const Lit lit(scene);
-  for (const double height : {1e-2, 1e-3, 1e-4}) {
+  for (const double height : {1e-2, 1e-3, 1e-4, 1e-5}) {
     ExpectIrradiance(lit, {0.1, height, -0.3}, kDown,
                      2 * PolygonIrradiance(FloorQuad(1), {0.1, height, -0.3}, {0, -1, 0}));
     EXPECT_NEAR(lit.E({0.1, height, -0.3}, kDown, 4096).x, 2 * kPi, 0.01 * 2 * kPi);
