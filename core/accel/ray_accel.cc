@@ -106,7 +106,8 @@ absl::StatusOr<std::shared_ptr<const RayAccel>> RayAccel::Build(
 
 std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& direction,
                                           float t_max) const {
-  if (record_ != nullptr) record_->push_back({origin, direction, t_max, false});
+  if (record_ != nullptr) [[unlikely]]
+    record_->push_back({origin, direction, t_max, false});
   RTCRayHit query;
   FillRay(query.ray, origin, direction, t_max);
   query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
@@ -123,7 +124,8 @@ std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& dire
 }
 
 bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max) const {
-  if (record_ != nullptr) record_->push_back({origin, direction, t_max, true});
+  if (record_ != nullptr) [[unlikely]]
+    record_->push_back({origin, direction, t_max, true});
   RTCRay ray;
   FillRay(ray, origin, direction, t_max);
 #if RTC_VERSION_MAJOR >= 4

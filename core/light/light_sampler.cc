@@ -33,12 +33,15 @@ float RangeWindow(const PreparedLight& light, float d_m) {
 // near to each other for their digits, and over so little the two densities are the same.
 constexpr float kSmallSolidAngle = 1e-3f;
 
-// [0, 1) -> [0, 1] by the density that goes from f0 to f1 (> 0), by which `pdf` is multiplied.
-F8 SampleLinear(F8 u, F8 f0, F8 f1, F8& pdf) {
+// [0, 1) -> [0, 1] by a density in proportion to what goes from f0 to f1 (both > 0).
+struct LinearDraw {
+  F8 x;
+  F8 twice_mean, twice_value;  // of the density, times any factor
+};
+LinearDraw SampleLinear(F8 u, F8 f0, F8 f1) {
   const F8 sum = f0 + f1;
   const F8 x = Min8(u * sum / (f0 + Sqrt8(f0 * f0 + u * (f1 * f1 - f0 * f0))), Set8(1.0f));
-  pdf *= Set8(2.0f) * (f0 + (f1 - f0) * x) / sum;
-  return x;
+  return {x, sum, Set8(2.0f) * (f0 + (f1 - f0) * x)};
 }
 
 // As UniformTriangle.
@@ -109,12 +112,12 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   out.height_m = Abs8(height);
   // Else at a corner, or in the triangle's plane: nothing arrives.
   out.any = (length_a > zero) & (length_b > zero) & (length_c > zero) & (out.height_m > zero);
-  const V8 a = to_a * (one / Max8(length_a, least)), b = to_b * (one / Max8(length_b, least)),
-           c = to_c * (one / Max8(length_c, least));
+  const F8 inverse_a = one / Max8(length_a, least), inverse_b = one / Max8(length_b, least),
+           inverse_c = one / Max8(length_c, least);
+  const V8 a = to_a * inverse_a, b = to_b * inverse_b, c = to_c * inverse_c;
   // The solid angle by Van Oosterom and Strackee 1983, as in WeightOf.
   const F8 ab = Dot(a, b), ca = Dot(c, a), ca_bc = ca + Dot(b, c);
-  const F8 triple =
-      (e.twice_area / Max8(length_a * length_b, least)) * (out.height_m / Max8(length_c, least));
+  const F8 triple = (e.twice_area * inverse_a * inverse_b) * (out.height_m * inverse_c);
   const F8 half_angle = DetAtan2Upper8(triple, one + ab + ca_bc);
   const F8 solid_angle = two * half_angle;
 
@@ -125,10 +128,11 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   const F8 cos_a = Max8(Dot(samples.n, a), least_cosine);
   const F8 cos_b = Max8(Dot(samples.n, b), least_cosine);
   const F8 cos_c = Max8(Dot(samples.n, c), least_cosine);
-  F8 warp_pdf = one;
-  const F8 v = SampleLinear(samples.v, two * cos_b, cos_a + cos_c, warp_pdf);
-  const F8 u =
-      SampleLinear(samples.u, cos_b + (cos_a - cos_b) * v, cos_b + (cos_c - cos_b) * v, warp_pdf);
+  const LinearDraw draw_v = SampleLinear(samples.v, two * cos_b, cos_a + cos_c);
+  const F8 v = draw_v.x;
+  const LinearDraw draw_u =
+      SampleLinear(samples.u, cos_b + (cos_a - cos_b) * v, cos_b + (cos_c - cos_b) * v);
+  const F8 u = draw_u.x;
   // The sub-triangle of area u Ω: its third corner d lies on the arc from a to c, where a is
   // mirrored at `middle`.
   const SinCos8 part = DetSinCos8(u * half_angle);
@@ -147,7 +151,8 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   out.any &= cos_l * height > zero;
   out.direction = w;
   out.distance_m = height / cos_l;
-  out.inverse_pdf_sr = solid_angle / warp_pdf;
+  out.inverse_pdf_sr = solid_angle * (draw_u.twice_mean * draw_v.twice_mean) /
+                       (draw_u.twice_value * draw_v.twice_value);
 
   const M8 small = solid_angle <= Set8(kSmallSolidAngle);
   if (Bits8(small & out.any) == 0) return out;
@@ -287,19 +292,12 @@ void LightSampler::AddPunctualLights() {
 // the arc tangent to 0.5 %. It is 0 only if the triangle lies below the horizon or is seen edge-on.
 F8 LightSampler::WeightOf(const EmitterLanes& e, const V8& p, const V8& n) {
   const F8 zero = Set8(0), one = Set8(1), least = Set8(std::numeric_limits<float>::min());
-  const auto unit = [&](const V8& corner, V8& direction, F8& length) {
-    const V8 to = corner - p;
-    length = Sqrt8(Length2(to));
-    direction = to * (one / Max8(length, least));
-    return to;
-  };
-  V8 a, b, c;
-  F8 length_a, length_b, length_c;
-  const V8 to_a = unit(e.a, a, length_a);
-  unit(e.b, b, length_b);
-  unit(e.c, c, length_c);
+  const auto inverse_of = [&](const V8& to) { return one / Max8(Sqrt8(Length2(to)), least); };
+  const V8 to_a = e.a - p, to_b = e.b - p, to_c = e.c - p;
+  const F8 inverse_a = inverse_of(to_a), inverse_b = inverse_of(to_b), inverse_c = inverse_of(to_c);
+  const V8 a = to_a * inverse_a, b = to_b * inverse_b, c = to_c * inverse_c;
   const F8 height = Abs8(Dot(to_a, e.normal));
-  const F8 y = (e.twice_area / Max8(length_a * length_b, least)) * (height / Max8(length_c, least));
+  const F8 y = (e.twice_area * inverse_a * inverse_b) * (height * inverse_c);
   const F8 x = one + Dot(a, b) + Dot(b, c) + Dot(c, a);
   // atan2(y, x), y >= 0, by the smaller quotient of the two.
   const F8 abs_x = Abs8(x);
@@ -351,30 +349,48 @@ void LightSampler::Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f
   Store8(weights.data(), Select8(d2 > zero, Min8(Max8(weight, zero), Set8(1e30f)), zero));
 }
 
-V8 LightSampler::Irradiance8(const SurfacePoints8& points, uint64_t key, unsigned dimension,
-                             LightCounters& counters) const {
-  const V8 origin = points.p + points.ng * Set8(accel_->surface_offset_m());
-  V8 irradiance{Vec3f()};
-  if (!directional_lights_.empty() || !positioned_lights_.empty()) {
-    for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
+void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64_t key,
+                                  unsigned dimension, std::span<V8> irradiance,
+                                  LightCounters& counters) const {
+  const auto for_each_lane = [&](size_t i, const auto& from) {
+    for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
       const auto k = static_cast<size_t>(std::countr_zero(rest));
-      const Query q{points.p.Lane(k), points.ng.Lane(k), points.n.Lane(k), origin.Lane(k), 1, key,
-                    points.index[k],  dimension};
-      irradiance.SetLane(k, FromAllPunctual(q, counters));
+      const Vec3f p = points[i].p.Lane(k), ng = points[i].ng.Lane(k), n = points[i].n.Lane(k);
+      const Query q{p, ng, n, accel_->LeaveSurface(p, ng), 1, key, points[i].index[k], dimension};
+      irradiance[i].SetLane(k, irradiance[i].Lane(k) + from(q));
+    }
+  };
+  const bool any_punctual = !directional_lights_.empty() || !positioned_lights_.empty();
+  for (size_t i = 0; i < points.size(); ++i) {
+    irradiance[i] = V8(Vec3f());
+    if (any_punctual) {
+      for_each_lane(i, [&](const Query& q) { return FromAllPunctual(q, counters); });
     }
   }
   if (!emitters_.empty()) {
-    irradiance = irradiance + FromEmitters(points, origin, key, dimension, counters);
+    constexpr size_t kTogether = 8;
+    std::array<ShadowRays8, kTogether> rays;
+    for (size_t first = 0; first < points.size(); first += kTogether) {
+      const size_t count = std::min(points.size() - first, kTogether);
+      for (size_t i = 0; i < count; ++i) {
+        rays[i] = RaysTo(SampleEach(points[first + i], key, dimension));
+        const auto lanes = static_cast<uint32_t>(std::popcount(points[first + i].active));
+        counters.samples += lanes;
+        counters.skipped_facing_away +=
+            lanes - static_cast<uint32_t>(std::popcount(rays[i].active));
+      }
+      for (size_t i = 0; i < count; ++i) {
+        Trace(rays[i], counters);
+        irradiance[first + i] = irradiance[first + i] + rays[i].arriving;
+      }
+    }
   }
-  if (!has_sky_) return irradiance;
-  for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
-    const auto k = static_cast<size_t>(std::countr_zero(rest));
-    const Query q{points.p.Lane(k), points.ng.Lane(k), points.n.Lane(k), origin.Lane(k), 1, key,
-                  points.index[k],  dimension};
-    irradiance.SetLane(k, irradiance.Lane(k) + (environment_ != nullptr ? FromMap(q, counters)
-                                                                        : FromSky(q, counters)));
+  if (!has_sky_) return;
+  for (size_t i = 0; i < points.size(); ++i) {
+    for_each_lane(i, [&](const Query& q) {
+      return environment_ != nullptr ? FromMap(q, counters) : FromSky(q, counters);
+    });
   }
-  return irradiance;
 }
 
 Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
@@ -540,6 +556,12 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
   const auto weigh = [&](uint32_t block, LightTree::Weights& weights) {
     Weigh(emitter_blocks_[block], q.origin, q.n, weights);
   };
+  std::array<F8, LightTree::kWidth> of_block;
+  if (emitter_tree_.is_one_block()) {
+    alignas(32) LightTree::Weights weights;
+    weigh(0, weights);
+    for (size_t i = 0; i < LightTree::kWidth; ++i) of_block[i] = Set8(weights[i]);
+  }
   EmitterSamples samples;
   samples.origin = V8(q.origin);
   samples.n = V8(q.n);
@@ -549,27 +571,32 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
   for (uint32_t first = 0; first < q.samples; first += LightTree::kWidth) {
     const U8 index = lanes + (q.first_index + first);
     const U8 bits = axis_u.BitsOf(index);
-    samples.v = axis_v.PointsOf(index);
-    samples.active = 0;
     const uint32_t count = std::min(q.samples - first, LightTree::kWidth);
-    for (uint32_t k = 0; k < count; ++k) {
-      double u = bits[k] * 0x1p-32;
-      samples.Set(k, u, emitter_tree_.Choose(q.origin, q.n, u, cache, weigh));
+    samples.v = axis_v.PointsOf(index);
+    if (emitter_tree_.is_one_block()) {
+      samples.Set(LightTree::ChooseInBlock8(of_block, bits), (1u << count) - 1u);
+    } else {
+      samples.active = 0;
+      for (uint32_t k = 0; k < count; ++k) {
+        double u = bits[k] * 0x1p-32;
+        samples.Set(k, u, emitter_tree_.Choose(q.origin, q.n, u, cache, weigh));
+      }
     }
+    ShadowRays8 rays = RaysTo(samples);
     counters.samples += count;
-    counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(samples.active));
-    const V8 part = FromEmitters8(samples, counters);
-    for (uint32_t k = 0; k < count; ++k) sum += part.Lane(k);
+    counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(rays.active));
+    Trace(rays, counters);
+    for (uint32_t k = 0; k < count; ++k) sum += rays.arriving.Lane(k);
   }
   return sum / static_cast<float>(q.samples);
 }
 
-V8 LightSampler::FromEmitters(const SurfacePoints8& points, const V8& origin, uint64_t key,
-                              unsigned dimension, LightCounters& counters) const {
+LightSampler::EmitterSamples LightSampler::SampleEach(const SurfacePoints8& points, uint64_t key,
+                                                      unsigned dimension) const {
   const uint32_t seed = static_cast<uint32_t>(HashKey(key, 1));
   const U8 bits = OwenSobolAxis(dimension, seed).BitsOf(points.index);
   EmitterSamples samples;
-  samples.origin = origin;
+  samples.origin = points.p + points.ng * Set8(accel_->surface_offset_m());
   samples.n = points.n;
   samples.ng = points.ng;
   samples.v = OwenSobolAxis(dimension + 1, seed).PointsOf(points.index);
@@ -578,67 +605,71 @@ V8 LightSampler::FromEmitters(const SurfacePoints8& points, const V8& origin, ui
     std::array<F8, LightTree::kWidth> weights{};
     for (uint32_t place = 0; place < LightTree::kWidth; ++place) {
       if (!(emitters_[place].area_m2 > 0.0f)) continue;
-      weights[place] = WeightOf(LoadEmitters(U8{} + place), origin, points.n);
+      weights[place] = WeightOf(LoadEmitters(U8{} + place), samples.origin, points.n);
     }
-    const LightTree::Choices8 choices = LightTree::ChooseInBlock8(weights, bits);
-    samples.place = choices.place;
-    samples.probability = choices.probability;
-    samples.u = Min8(choices.u, Set8(kBelowOne));
-    samples.active = points.active & Bits8(choices.any);
-  } else {
-    for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
-      const auto k = static_cast<uint32_t>(std::countr_zero(rest));
-      double u = bits[k] * 0x1p-32;
-      const Vec3f p = origin.Lane(k), n = points.n.Lane(k);
-      LightTree::Cache cache;
-      samples.Set(
-          k, u,
-          emitter_tree_.Choose(p, n, u, cache, [&](uint32_t block, LightTree::Weights& weights) {
-            Weigh(emitter_blocks_[block], p, n, weights);
-          }));
-    }
+    samples.Set(LightTree::ChooseInBlock8(weights, bits), points.active);
+    return samples;
   }
-  const auto count = static_cast<uint32_t>(std::popcount(points.active));
-  counters.samples += count;
-  counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(samples.active));
-  return FromEmitters8(samples, counters);
+  for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {
+    const auto k = static_cast<uint32_t>(std::countr_zero(rest));
+    double u = bits[k] * 0x1p-32;
+    const Vec3f p = samples.origin.Lane(k), n = points.n.Lane(k);
+    LightTree::Cache cache;
+    samples.Set(
+        k, u,
+        emitter_tree_.Choose(p, n, u, cache, [&](uint32_t block, LightTree::Weights& weights) {
+          Weigh(emitter_blocks_[block], p, n, weights);
+        }));
+  }
+  return samples;
 }
 
-V8 LightSampler::FromEmitters8(const EmitterSamples& samples, LightCounters& counters) const {
-  const PreparedScene& scene = accel_->scene();
-  V8 sum{Vec3f()};
-  if (samples.active == 0) return sum;
+LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) const {
   const EmitterDirections to = Directions(samples);
   const F8 zero = Set8(0.0f);
   const F8 cosine = Dot(samples.n, to.direction);
-  const unsigned arriving =
-      samples.active & Bits8(to.any & (cosine > zero) & (Dot(samples.ng, to.direction) > zero));
-  counters.skipped_facing_away += static_cast<uint32_t>(std::popcount(samples.active ^ arriving));
+  ShadowRays8 rays;
+  for (size_t k = 0; k < LightTree::kWidth; ++k) {
+    rays.origin[k] = samples.origin.Lane(k);
+    rays.direction[k] = to.direction.Lane(k);
+  }
   // Up to two surface offsets over the emitter's plane, not along the ray: a grazing ray would
   // hit the emitter itself.
-  const F8 reach_m =
+  rays.reach_m =
       to.distance_m * (Set8(1.0f) - Set8(2.0f * accel_->surface_offset_m()) / to.height_m);
-  const F8 weight = cosine * to.inverse_pdf_sr / samples.probability;
-  for (unsigned rest = arriving; rest != 0; rest &= rest - 1) {
+  rays.active =
+      samples.active & Bits8(to.any & (cosine > zero) & (Dot(samples.ng, to.direction) > zero));
+  rays.arriving = V8(Vec3f());
+  for (unsigned rest = rays.active; rest != 0; rest &= rest - 1) {
     const auto k = static_cast<size_t>(std::countr_zero(rest));
     const Emitter& e = emitters_[samples.place[k]];
-    const Vec3f origin = samples.origin.Lane(k), direction = to.direction.Lane(k);
     Rgb radiance = e.radiance;
     if (e.varies) {
-      radiance = e.RadianceAt(scene, origin + direction * to.distance_m[k]);
-      if (!(MaxComponent(radiance) > 0.0f)) {  // black, or a hole of an alpha mask
-        ++counters.skipped_facing_away;
-        continue;
-      }
+      radiance =
+          e.RadianceAt(accel_->scene(), rays.origin[k] + rays.direction[k] * to.distance_m[k]);
+      // Black, or a hole of an alpha mask.
+      if (!(MaxComponent(radiance) > 0.0f)) rays.active &= ~(1u << k);
     }
-    ++counters.rays;
-    if (reach_m[k] > 0.0f && accel_->Occluded(origin, direction, reach_m[k])) {
-      ++counters.blocked;
-      continue;
-    }
-    sum.SetLane(k, radiance * weight[k]);
+    rays.arriving.SetLane(k, radiance);
   }
-  return sum;
+  rays.arriving =
+      Select8(Mask8(rays.active),
+              rays.arriving * (cosine * to.inverse_pdf_sr / samples.probability), V8(Vec3f()));
+  return rays;
+}
+
+void LightSampler::Trace(ShadowRays8& rays, LightCounters& counters) const {
+  unsigned blocked = 0;
+  for (unsigned rest = rays.active; rest != 0; rest &= rest - 1) {
+    const auto k = static_cast<size_t>(std::countr_zero(rest));
+    if (!(rays.reach_m[k] > 0.0f)) continue;
+    if (accel_->Occluded(rays.origin[k], rays.direction[k], rays.reach_m[k])) {
+      blocked |= 1u << k;
+    }
+  }
+  counters.rays += static_cast<uint32_t>(std::popcount(rays.active));
+  counters.blocked += static_cast<uint32_t>(std::popcount(blocked));
+  rays.arriving = Select8(Mask8(blocked), V8(Vec3f()), rays.arriving);
 }
 
 // The radiance at the point of a textured or holed emitter that is nearest to `q`.

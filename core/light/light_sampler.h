@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <memory>
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "core/accel/ray_accel.h"
@@ -78,9 +79,9 @@ class LightSampler {
   static constexpr uint32_t kRefined = 4, kFewestRefined = 4;
 
   // Irradiance(p, ng, n, 1, key, index, dimension, counters) of each active lane, to the same bits,
-  // in about half the time; 0 in the others.
-  V8 Irradiance8(const SurfacePoints8& points, uint64_t key, unsigned dimension,
-                 LightCounters& counters) const;
+  // in less than half the time without rays; 0 in the others. `irradiance` is as long as `points`.
+  void IrradianceEach(std::span<const SurfacePoints8> points, uint64_t key, unsigned dimension,
+                      std::span<V8> irradiance, LightCounters& counters) const;
 
  private:
   // What an estimate is made for.
@@ -130,6 +131,12 @@ class LightSampler {
     F8 probability = Set8(1.0f);  // of the emitter
     unsigned active = 0;
 
+    void Set(const LightTree::Choices8& choices, unsigned lanes) {
+      u = Min8(choices.u, Set8(kBelowOne));
+      place = choices.place;
+      probability = choices.probability;
+      active = lanes & Bits8(choices.any);
+    }
     void Set(uint32_t lane, double u_left, const std::optional<LightTree::Choice>& choice) {
       if (!choice) return;
       u[lane] = std::min(static_cast<float>(u_left), kBelowOne);
@@ -149,11 +156,18 @@ class LightSampler {
   EmitterLanes LoadEmitters(const U8& place) const;
   // By solid angle and nearly by the cosine to n.
   EmitterDirections Directions(const EmitterSamples& samples) const;
-  // What each sample adds, its ray included; 0 in lanes that are not active.
-  V8 FromEmitters8(const EmitterSamples& samples, LightCounters& counters) const;
+  // What arrives if nothing is in the way, 0 in lanes that are not active, and what may be.
+  struct ShadowRays8 {
+    std::array<Vec3f, LightTree::kWidth> origin, direction;
+    F8 reach_m;
+    V8 arriving;
+    unsigned active;
+  };
+  ShadowRays8 RaysTo(const EmitterSamples& samples) const;
+  // Traces the rays: nothing arrives where they are blocked.
+  void Trace(ShadowRays8& rays, LightCounters& counters) const;
   // One sample for each point.
-  V8 FromEmitters(const SurfacePoints8& points, const V8& origin, uint64_t key, unsigned dimension,
-                  LightCounters& counters) const;
+  EmitterSamples SampleEach(const SurfacePoints8& points, uint64_t key, unsigned dimension) const;
 
   void AddEmitters();
   void AddPunctualLights();

@@ -10,20 +10,24 @@ namespace farpoint {
 
 namespace {
 
-uint32_t SwapBytes(uint32_t x) { return __builtin_bswap32(x); }
-U8 SwapBytes(const U8& x) {
-  const __m256i order = _mm256_set_epi8(12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3,  //
-                                        12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3);
-  return reinterpret_cast<U8>(_mm256_shuffle_epi8(reinterpret_cast<__m256i>(x), order));
-}
-
-// Bits is uint32_t or U8.
-template <typename Bits>
-Bits ReverseBits(Bits x) {
+uint32_t ReverseBits(uint32_t x) {
   x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
   x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
   x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
-  return SwapBytes(x);
+  return __builtin_bswap32(x);
+}
+// The bytes of each lane in turn, and in each byte the two halves by a table.
+U8 ReverseBits(const U8& x) {
+  const __m256i order = _mm256_set_epi8(12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3,  //
+                                        12, 13, 14, 15, 8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3);
+  const __m256i reversed = _mm256_set_epi8(15, 7, 11, 3, 13, 5, 9, 1, 14, 6, 10, 2, 12, 4, 8, 0,  //
+                                           15, 7, 11, 3, 13, 5, 9, 1, 14, 6, 10, 2, 12, 4, 8, 0);
+  const __m256i half = _mm256_set1_epi8(0x0f);
+  const __m256i swapped = _mm256_shuffle_epi8(reinterpret_cast<__m256i>(x), order);
+  const __m256i low = _mm256_shuffle_epi8(reversed, _mm256_and_si256(swapped, half));
+  const __m256i high =
+      _mm256_shuffle_epi8(reversed, _mm256_and_si256(_mm256_srli_epi32(swapped, 4), half));
+  return reinterpret_cast<U8>(_mm256_or_si256(_mm256_slli_epi32(low, 4), high));
 }
 
 // Generator matrices of dimensions 0 to 3, from the primitive polynomials and initial direction
@@ -50,15 +54,20 @@ constexpr std::array<std::array<uint32_t, 32>, 4> MakeDirections() {
 }
 constexpr auto kDirections = MakeDirections();
 
-// What each value of each byte of an index adds: four look-ups instead of a loop over the bits.
+// What each value of each byte of an index adds, its bits reversed, as the scrambling wants them:
+// four look-ups instead of a loop over the bits.
 constexpr std::array<std::array<std::array<uint32_t, 256>, 4>, 4> MakeByteTables() {
   std::array<std::array<std::array<uint32_t, 256>, 4>, 4> tables{};
   for (size_t d = 0; d < 4; ++d) {
     for (size_t byte = 0; byte < 4; ++byte) {
       auto& table = tables[d][byte];
       for (size_t bit = 0; bit < 8; ++bit) {
+        uint32_t reversed = 0;
+        for (uint32_t b = 0; b < 32; ++b) {
+          reversed |= (kDirections[d][8 * byte + bit] >> b & 1u) << (31 - b);
+        }
         for (size_t i = 0; i < size_t{1} << bit; ++i) {
-          table[(size_t{1} << bit) + i] = table[i] ^ kDirections[d][8 * byte + bit];
+          table[(size_t{1} << bit) + i] = table[i] ^ reversed;
         }
       }
     }
@@ -67,7 +76,8 @@ constexpr std::array<std::array<std::array<uint32_t, 256>, 4>, 4> MakeByteTables
 }
 constexpr auto kByteTables = MakeByteTables();
 
-// Permutes the bits of x from the lowest up, each depending on those below it only.
+// Permutes the bits of x from the lowest up, each depending on those below it only: between two
+// reversals, nested uniform (Owen) scrambling. Bits is uint32_t or U8.
 template <typename Bits>
 Bits LaineKarrasPermutation(Bits x, uint32_t seed) {
   x ^= x * 0x3d20adeau;
@@ -78,18 +88,13 @@ Bits LaineKarrasPermutation(Bits x, uint32_t seed) {
   return x;
 }
 
-template <typename Bits>
-Bits NestedUniformScramble(const Bits& x, uint32_t seed) {
-  return ReverseBits(LaineKarrasPermutation(ReverseBits(x), seed));
-}
-
 }  // namespace
 
 uint32_t OwenSobolBits(uint32_t index, unsigned dimension, uint32_t seed) {
   const auto& table = kByteTables[dimension];
   uint32_t x = table[0][index & 0xffu];
   for (uint32_t i = index >> 8, byte = 1; i != 0; i >>= 8, ++byte) x ^= table[byte][i & 0xffu];
-  return NestedUniformScramble(x, static_cast<uint32_t>(HashKey(seed, dimension)));
+  return ReverseBits(LaineKarrasPermutation(x, static_cast<uint32_t>(HashKey(seed, dimension))));
 }
 
 U8 OwenSobolAxis::BitsOf(const U8& index) const {
@@ -102,11 +107,11 @@ U8 OwenSobolAxis::BitsOf(const U8& index) const {
   };
   U8 x = look_up(0);
   if (Bits8(reinterpret_cast<M8>(index > 0xffu)) != 0) x ^= look_up(1) ^ look_up(2) ^ look_up(3);
-  return NestedUniformScramble(x, scramble_);
+  return ReverseBits(LaineKarrasPermutation(x, scramble_));
 }
 
 uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed) {
-  return NestedUniformScramble(index, seed);
+  return ReverseBits(LaineKarrasPermutation(ReverseBits(index), seed));
 }
 
 Vec2f ConcentricDisc(float u, float v) {

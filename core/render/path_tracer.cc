@@ -2,9 +2,11 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <cmath>
 #include <cstring>
 #include <optional>
+#include <span>
 
 #include "core/math/sampling.h"
 #include "core/math/simd4d.h"
@@ -20,22 +22,23 @@ constexpr uint32_t kBatches = 8;
 constexpr uint32_t kTurn = 64;
 constexpr uint32_t kWidth = 8;
 
-// As PreparedScene::GeometricNormal, to the same bits: in double, rounded once.
+// As PreparedScene::GeometricNormal: in double, rounded at the end. Triangles of a prepared scene
+// are not so small or large that a square of their area would leave the range of a double.
 V8 GeometricNormals(const V8& a, const V8& b, const V8& c) {
-  D4 n[3][2];
+  std::array<D4, 2> x, y, z;
   for (int h = 0; h < 2; ++h) {
     const D4 ax = Half4(a.x, h), ay = Half4(a.y, h), az = Half4(a.z, h);
     const D4 ux = Half4(b.x, h) - ax, uy = Half4(b.y, h) - ay, uz = Half4(b.z, h) - az;
     const D4 vx = Half4(c.x, h) - ax, vy = Half4(c.y, h) - ay, vz = Half4(c.z, h) - az;
-    const D4 x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
-    const D4 m = Max4(Max4(Abs4(x), Abs4(y)), Abs4(z));
-    const D4 sx = x / m, sy = y / m, sz = z / m;
-    const D4 length = Sqrt4(sx * sx + sy * sy + sz * sz);
-    n[0][h] = sx / length;
-    n[1][h] = sy / length;
-    n[2][h] = sz / length;
+    x[h] = uy * vz - uz * vy;
+    y[h] = uz * vx - ux * vz;
+    z[h] = ux * vy - uy * vx;
+    const D4 scale = Set4(1.0) / Sqrt4(x[h] * x[h] + y[h] * y[h] + z[h] * z[h]);
+    x[h] *= scale;
+    y[h] *= scale;
+    z[h] *= scale;
   }
-  return {Join8(n[0][0], n[0][1]), Join8(n[1][0], n[1][1]), Join8(n[2][0], n[2][1])};
+  return {Join8(x[0], x[1]), Join8(y[0], y[1]), Join8(z[0], z[1])};
 }
 
 // Paths of a turn that have hit what may reflect, side by side.
@@ -83,8 +86,8 @@ void KeepWhatReflects(const PreparedScene& scene, Hits& hits) {
   hits.count = kept;
 }
 
-// Where eight paths have hit, with normals on the side that they came from: to the same bits as
-// PreparedScene gives them.
+// Where eight paths have hit, with normals on the side that they came from, as PreparedScene gives
+// them.
 SurfacePoints8 SurfaceAt(const Hits& hits, size_t i) {
   const F8 zero = Set8(0.0f), one = Set8(1.0f);
   const F8 b1 = Load8(&hits.b1[i]), b2 = Load8(&hits.b2[i]);
@@ -130,45 +133,46 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
   const U8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
   for (uint32_t first = 0; first < paths; first += kTurn) {
     const uint32_t count = std::min(kTurn, paths - first);
-    std::array<V8, kTurn / kWidth> directions;
-    std::array<unsigned, kTurn / kWidth> leaves;
+    std::array<Vec3f, kTurn> directions;
+    uint64_t leaving = 0;  // bit k: path k
     for (uint32_t k = 0; k < count; k += kWidth) {
       const U8 index = lanes + (first + k);
       const V8 w = frame.ToWorld(CosineHemisphere8(axis_u.PointsOf(index), axis_v.PointsOf(index)));
-      directions[k / kWidth] = w;
       // Directions that the shading normal allows and the surface does not carry nothing.
-      leaves[k / kWidth] = Bits8(Dot(w, ng) > Set8(0.0f));
-      if (count - k < kWidth) leaves[k / kWidth] &= (1u << (count - k)) - 1u;
+      leaving |= uint64_t{Bits8(Dot(w, ng) > Set8(0.0f))} << k;
+      for (uint32_t l = 0; l < kWidth; ++l) directions[k + l] = w.Lane(l);
     }
+    if (count < kTurn) leaving &= (uint64_t{1} << count) - 1;
+    rays += static_cast<uint64_t>(std::popcount(leaving));
     hits.count = 0;
-    for (uint32_t k = 0; k < count; ++k) {
-      if ((leaves[k / kWidth] >> (k % kWidth) & 1u) == 0) continue;
-      const Vec3f w = directions[k / kWidth].Lane(k % kWidth);
-      ++rays;
-      const std::optional<RayHit> hit = accel.Intersect(origin, w);
+    for (; leaving != 0; leaving &= leaving - 1) {
+      const auto k = static_cast<uint32_t>(std::countr_zero(leaving));
+      const std::optional<RayHit> hit = accel.Intersect(origin, directions[k]);
       if (!hit) continue;
       const uint32_t i = hits.count++;
       hits.path[i] = first + k;
       hits.triangle[i] = hit->triangle;
       hits.b1[i] = hit->b1;
       hits.b2[i] = hit->b2;
-      hits.direction.Set(i, w);
     }
+    for (uint32_t i = 0; i < hits.count; ++i)
+      hits.direction.Set(i, directions[hits.path[i] - first]);
     KeepWhatReflects(scene, hits);
-    for (uint32_t i = 0; i < hits.count; i += kWidth) {
-      const uint32_t width = std::min(kWidth, hits.count - i);
-      SurfacePoints8 points = SurfaceAt(hits, i);
-      points.active = (1u << width) - 1u;
-      const V8 e = lights.Irradiance8(points, light_key, 2, counters);
-      for (uint32_t k = 0; k < width; ++k) {
-        const Rgb arriving = e.Lane(k);
-        // Textures are looked up where light arrives only.
-        if (!(MaxComponent(arriving) > 0.0f)) continue;
-        const uint32_t h = i + k;
-        while (hits.path[h] >= next_batch) next_batch = FirstOf(++b + 1, paths);
-        batch[b] +=
-            Vec3d(scene.Surface(hits.triangle[h], hits.b1[h], hits.b2[h]).albedo * arriving);
-      }
+    std::array<SurfacePoints8, kTurn / kWidth> points;
+    std::array<V8, kTurn / kWidth> irradiance;
+    const size_t groups = (hits.count + kWidth - 1) / kWidth;
+    for (uint32_t g = 0; g < groups; ++g) {
+      points[g] = SurfaceAt(hits, g * kWidth);
+      points[g].active = (1u << std::min(kWidth, hits.count - g * kWidth)) - 1u;
+    }
+    lights.IrradianceEach(std::span(points).first(groups), light_key, 2,
+                          std::span(irradiance).first(groups), counters);
+    for (uint32_t i = 0; i < hits.count; ++i) {
+      const Rgb arriving = irradiance[i / kWidth].Lane(i % kWidth);
+      // Textures are looked up where light arrives only.
+      if (!(MaxComponent(arriving) > 0.0f)) continue;
+      while (hits.path[i] >= next_batch) next_batch = FirstOf(++b + 1, paths);
+      batch[b] += Vec3d(scene.Surface(hits.triangle[i], hits.b1[i], hits.b2[i]).albedo * arriving);
     }
   }
   TracedIrradiance out;
