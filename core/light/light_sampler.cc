@@ -145,8 +145,7 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   const V8 base = Select8(below < above, difference, sum);
   const V8 aside = base - b * Dot(b, base);
   const F8 sin2 = v * below * (two * (one - v) + v * above);
-  const V8 w =
-      Normalize(b * (one - v * below) + aside * (Sqrt8(sin2) / Sqrt8(Max8(Length2(aside), least))));
+  const V8 w = b * (one - v * below) + aside * Sqrt8(sin2 / Max8(Length2(aside), least));
   const F8 cos_l = Dot(w, e.normal);
   out.any &= cos_l * height > zero;
   out.direction = w;
@@ -200,6 +199,7 @@ void LightSampler::AddEmitters() {
     brightest = std::max(brightest, mean);
   }
   if (found.empty()) return;
+  emitter_count_ = static_cast<uint32_t>(found.size());
   // A power of two, so that weights are near 1 whatever the unit of radiance.
   const float scale = InversePowerOfTwo(brightest);
   std::vector<LightBounds> bounds(found.size());
@@ -560,7 +560,7 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
   if (emitter_tree_.is_one_block()) {
     alignas(32) LightTree::Weights weights;
     weigh(0, weights);
-    for (size_t i = 0; i < LightTree::kWidth; ++i) of_block[i] = Set8(weights[i]);
+    for (size_t i = 0; i < emitter_count_; ++i) of_block[i] = Set8(weights[i]);
   }
   EmitterSamples samples;
   samples.origin = V8(q.origin);
@@ -574,7 +574,8 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
     const uint32_t count = std::min(q.samples - first, LightTree::kWidth);
     samples.v = axis_v.PointsOf(index);
     if (emitter_tree_.is_one_block()) {
-      samples.Set(LightTree::ChooseInBlock8(of_block, bits), (1u << count) - 1u);
+      samples.Set(LightTree::ChooseInBlock8(std::span(of_block).first(emitter_count_), bits),
+                  (1u << count) - 1u);
     } else {
       samples.active = 0;
       for (uint32_t k = 0; k < count; ++k) {
@@ -602,12 +603,12 @@ LightSampler::EmitterSamples LightSampler::SampleEach(const SurfacePoints8& poin
   samples.v = OwenSobolAxis(dimension + 1, seed).PointsOf(points.index);
   if (emitter_tree_.is_one_block()) {
     // One emitter after the other for all points.
-    std::array<F8, LightTree::kWidth> weights{};
-    for (uint32_t place = 0; place < LightTree::kWidth; ++place) {
-      if (!(emitters_[place].area_m2 > 0.0f)) continue;
+    std::array<F8, LightTree::kWidth> weights;
+    for (uint32_t place = 0; place < emitter_count_; ++place) {
       weights[place] = WeightOf(LoadEmitters(U8{} + place), samples.origin, points.n);
     }
-    samples.Set(LightTree::ChooseInBlock8(weights, bits), points.active);
+    samples.Set(LightTree::ChooseInBlock8(std::span(weights).first(emitter_count_), bits),
+                points.active);
     return samples;
   }
   for (unsigned rest = points.active; rest != 0; rest &= rest - 1) {

@@ -190,6 +190,7 @@ class LightSampler {
   std::vector<Emitter> emitters_;  // by place in the tree's order; empty places have area 0
   std::vector<EmitterBlock> emitter_blocks_;
   LightTree emitter_tree_;
+  uint32_t emitter_count_ = 0;
   // Those with power; the positioned ones by place in the tree's order, empty places black.
   std::vector<PreparedLight> directional_lights_, positioned_lights_;
   uint32_t positioned_count_ = 0;

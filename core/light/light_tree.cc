@@ -214,34 +214,32 @@ uint32_t LightTree::Build(std::span<const LightBounds> lights, std::span<uint32_
   return at;
 }
 
-LightTree::Choices8 LightTree::ChooseInBlock8(const std::array<F8, kWidth>& weights,
-                                              const U8& u_bits) {
+LightTree::Choices8 LightTree::ChooseInBlock8(std::span<const F8> weights, const U8& u_bits) {
   constexpr double kBelowOne = 1.0 - 0x1p-53;
   const D4 zero = Set4(0.0), one = Set4(1.0);
   std::array<D4, 2> probability, rest, chosen, any;
   for (int h = 0; h < 2; ++h) {
     const D4 u = Half4(u_bits, h) * Set4(0x1p-32);
-    std::array<D4, kWidth> weight;
     D4 total = zero, positive = zero;
-    for (uint32_t k = 0; k < kWidth; ++k) {
-      weight[k] = Half4(weights[k], h);
-      total += weight[k];
-      positive += Select4(weight[k] > zero, one, zero);
+    for (const F8& w : weights) {
+      const D4 weight = Half4(w, h);
+      total += weight;
+      positive += Select4(weight > zero, one, zero);
     }
     const M4 two = positive == Set4(2.0);
     M4 open = total > zero;
     any[h] = Select4(open, one, zero);
     D4 sum = zero, before = zero, below = zero, at = zero;
-    for (uint32_t k = 0; k < kWidth; ++k) {
-      const M4 here = open & (weight[k] > zero);
-      if (Bits4(here) == 0) continue;
-      sum += Select4(here, weight[k], zero);
+    for (size_t k = 0; k < weights.size(); ++k) {
+      const D4 weight = Half4(weights[k], h);
+      const M4 here = open & (weight > zero);
+      sum += Select4(here, weight, zero);
       D4 border = sum / total;
       // As AtAnEighth.
       const D4 eighths = Truncate4(border * Set4(8.0) + Set4(0.5));
       border = Select4(two & (sum < total) & (eighths > zero) & (eighths < Set4(8.0)),
                        eighths * Set4(0.125), border);
-      at = Select4(here, Set4(k), at);
+      at = Select4(here, Set4(static_cast<double>(k)), at);
       before = Select4(here, below, before);
       below = Select4(here, border, below);
       open &= ~(here & (u < below));

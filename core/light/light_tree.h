@@ -86,8 +86,8 @@ class LightTree {
     F8 probability, u;
     M8 any;
   };
-  // weights[i]: of light i, for each point; `u` in 2^-32.
-  static Choices8 ChooseInBlock8(const std::array<F8, kWidth>& weights, const U8& u);
+  // weights[i]: of light i, for each point, up to the last one that there is; `u` in 2^-32.
+  static Choices8 ChooseInBlock8(std::span<const F8> weights, const U8& u);
 
  private:
   struct alignas(32) Node {

@@ -51,6 +51,11 @@ struct Hits {
       y[i] = v.y;
       z[i] = v.z;
     }
+    void Copy(size_t from, size_t to) {
+      x[to] = x[from];
+      y[to] = y[from];
+      z[to] = z[from];
+    }
     V8 Load(size_t i) const { return {Load8(&x[i]), Load8(&y[i]), Load8(&z[i])}; }
   };
   Rows direction, vertex[3], normal[3];
@@ -74,16 +79,26 @@ void KeepWhatReflects(const PreparedScene& scene, Hits& hits) {
     hits.triangle[k] = t;
     hits.b1[k] = hits.b1[i];
     hits.b2[k] = hits.b2[i];
-    hits.direction.x[k] = hits.direction.x[i];
-    hits.direction.y[k] = hits.direction.y[i];
-    hits.direction.z[k] = hits.direction.z[i];
+    hits.direction.Copy(i, k);
     hits.flat[k] = flat ? 1.0f : 0.0f;
     for (size_t c = 0; c < 3; ++c) {
       hits.vertex[c].Set(k, scene.vertices()[triangle.vertex[c]]);
-      if (!flat) hits.normal[c].Set(k, scene.normals()[triangle.vertex[c]]);
+      hits.normal[c].Set(k, flat ? Vec3f() : scene.normals()[triangle.vertex[c]]);
     }
   }
   hits.count = kept;
+  // The lanes of the last eight that are left over.
+  for (uint32_t k = kept; k % kWidth != 0; ++k) {
+    hits.path[k] = hits.path[kept - 1];
+    hits.b1[k] = hits.b1[kept - 1];
+    hits.b2[k] = hits.b2[kept - 1];
+    hits.flat[k] = hits.flat[kept - 1];
+    hits.direction.Copy(kept - 1, k);
+    for (size_t c = 0; c < 3; ++c) {
+      hits.vertex[c].Copy(kept - 1, k);
+      hits.normal[c].Copy(kept - 1, k);
+    }
+  }
 }
 
 // Where eight paths have hit, with normals on the side that they came from, as PreparedScene gives
@@ -129,7 +144,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
   const uint64_t light_key = HashKey(key, 12);
   Vec3d batch[kBatches];
   uint32_t b = 0, next_batch = FirstOf(1, paths);
-  Hits hits{};
+  Hits hits;
   const U8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
   for (uint32_t first = 0; first < paths; first += kTurn) {
     const uint32_t count = std::min(kTurn, paths - first);
