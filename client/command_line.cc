@@ -610,6 +610,9 @@ absl::Status CheckNeeds(const CommandLine& line) {
   if (line.verb != Verb::kRender && line.verb != Verb::kCompare) {
     FP_RETURN_IF_ERROR(CheckCoordinator(line.coordinator));
   }
+  if (!line.diff.empty() && !line.diff.ends_with(".png")) {
+    return Bad("--diff " + line.diff + ": the difference is a PNG file; end the name in .png");
+  }
   if (line.verb == Verb::kCompare && (line.image_a.empty() || line.image_b.empty())) {
     return Bad("IMAGE, REFERENCE: not given; name two .exr files");
   }

@@ -7,6 +7,7 @@
 #include <filesystem>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -91,6 +92,12 @@ std::string FetchCommand(const CommandLine& line, const JobId& job) {
   return command + " --coordinator " + line.coordinator;
 }
 
+void Say(const PreparedRequest& request, const CommandLine& line, Console& console) {
+  for (const std::string& note : request.notes) console.Info(note);
+  if (line.quiet) return;
+  for (const std::string& warning : request.warnings) console.Warn(warning);
+}
+
 absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& console,
                     bool& usage_error) {
   FP_RETURN_IF_ERROR(CheckOutputs(line));
@@ -98,7 +105,7 @@ absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& cons
   FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   FP_ASSIGN_OR_RETURN(PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
-  for (const std::string& note : request.notes) console.Info(note);
+  Say(request, line, console);
   if (request.spec.start_paused) {
     console.Info("start_paused says nothing to render: nobody could resume the job");
     request.spec.start_paused = false;
@@ -138,7 +145,7 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
   FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   FP_ASSIGN_OR_RETURN(PreparedRequest request,
                       PrepareRequest(line.scene, line.render_flags, usage_error));
-  for (const std::string& note : request.notes) console.Info(note);
+  Say(request, line, console);
   JobSpec& spec = request.spec;
   if (line.title) spec.title = *line.title;
   if (line.priority) spec.priority = *line.priority;
@@ -246,7 +253,7 @@ absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& conso
                                " frames are written");
 }
 
-absl::Status Compare(const CommandLine& line) {
+absl::Status Compare(const CommandLine& line, Console& console) {
   FP_RETURN_IF_ERROR(CheckOutputs(line));
   FP_ASSIGN_OR_RETURN(const ExrImage a, ReadExr(line.image_a));
   FP_ASSIGN_OR_RETURN(const ExrImage b, ReadExr(line.image_b));
@@ -254,10 +261,14 @@ absl::Status Compare(const CommandLine& line) {
   options.layer = line.layer;
   options.ref_layer = line.ref_layer;
   options.noise = line.noise;
+  options.image_name = line.image_a;
+  options.ref_name = line.image_b;
   if (!line.mask.empty()) {
     FP_ASSIGN_OR_RETURN(options.mask, ReadMask(line.mask));
   }
   FP_ASSIGN_OR_RETURN(const CompareResult result, CompareImages(a, b, options));
+  const std::optional<std::string> warning = ComparisonWarning(result);
+  if (warning && !line.quiet) console.Warn(*warning);
   if (!line.diff.empty()) FP_RETURN_IF_ERROR(WriteDiffPng(line.diff, a, b, options, 0));
   if (!line.json.empty()) FP_RETURN_IF_ERROR(WriteText(line.json, ComparisonJson(result)));
   // A stdout that carries JSON carries nothing else.
@@ -302,7 +313,7 @@ int RunCommand(const CommandLine& line, const StopFlag& stop, Console& console) 
       status = Fetch(line, stop, console, usage_error);
       break;
     case Verb::kCompare:
-      status = Compare(line);
+      status = Compare(line, console);
       break;
     default:
       status = AskFarm(line, stop, console);

@@ -130,6 +130,7 @@ absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
   }
   FP_RETURN_IF_ERROR(Annotate(ValidateJob(request.spec), scene));
   request.notes = NotesOn(request, flags);
+  request.warnings = IneffectiveFlags(flags, request.spec.settings);
   return request;
 }
 

@@ -15,8 +15,10 @@ namespace farpoint {
 struct PreparedRequest {
   JobSpec spec;       // complete and valid
   AssetBundle asset;  // the files that spec.asset_files names
-  // What a user should know, one line each: flags and frames that have no effect.
+  // What a user should know, one line each: --fps and frames that have no effect.
   std::vector<std::string> notes;
+  // Flags of the method that have no effect, see IneffectiveFlags.
+  std::vector<std::string> warnings;
 };
 
 // `scene` is a scene or a job file. A job file's paths (asset, environment map) are relative to it,

@@ -516,6 +516,73 @@ constexpr RenderFlag kRenderFlags[] = {
      }},
 };
 
+// What the settings in force make use of.
+class Use {
+ public:
+  explicit Use(const RenderSettings& settings) : s_(settings) {}
+
+  bool Is(Integrator integrator) const { return s_.integrator == integrator; }
+  bool adaptive() const { return s_.adaptive(); }
+  bool surfels() const { return s_.point_based(); }
+  // Cuts of the tree, drawn into microbuffers.
+  bool cuts() const {
+    return surfels() && (!Is(Integrator::kFpbgi) || s_.fill_in_force() == Fill::kCut);
+  }
+  // Clusters whose buffers hold what is far only.
+  bool far_and_near() const { return Is(Integrator::kFpbgi) && !adaptive() && cuts(); }
+  bool quality() const {
+    if (Is(Integrator::kIrrcache)) return s_.cache_error == 0.0f || s_.cache_samples == 0;
+    return adaptive();
+  }
+  bool filter() const { return s_.spp > 1; }
+
+  // The flags that decide the method.
+  std::string method() const {
+    std::string text = "--integrator ";
+    text.append(NameOf(s_.integrator));
+    if (Is(Integrator::kIrrcache) && !quality())
+      return text + ", --cache-error and --cache-samples";
+    if (!Is(Integrator::kFpbgi)) return text;
+    text += adaptive() ? ", adaptive clusters" : ", --clusters " + std::to_string(s_.clusters);
+    return text + (cuts() ? " filled by cuts" : " filled by rays");
+  }
+
+ private:
+  const RenderSettings& s_;
+};
+
+// Flags that only some methods read. Those without a rule always count.
+struct UseRule {
+  std::string_view flag;
+  bool (*counts)(const Use&);
+  std::string_view where;  // "it counts …"
+  bool of_method = true;   // else of --spp
+};
+constexpr auto kPointBased = "with --integrator fpbgi, pbgi or dpbgi"sv;
+constexpr auto kDrawn = "with --integrator pbgi or dpbgi and with --fill cut"sv;
+constexpr auto kCaches = "with --integrator irrcache"sv;
+constexpr auto kFactorized = "with --integrator fpbgi"sv;
+constexpr auto kManySamples = "from --spp 2 on"sv;
+constexpr UseRule kUseRules[] = {
+    {"--preset", [](const Use& u) { return u.surfels(); }, kPointBased},
+    {"--filter", [](const Use& u) { return u.filter(); }, kManySamples, false},
+    {"--filter-width", [](const Use& u) { return u.filter(); }, kManySamples, false},
+    {"--paths", [](const Use& u) { return u.Is(Integrator::kPt); }, "with --integrator pt"},
+    {"--points", [](const Use& u) { return u.surfels(); }, kPointBased},
+    {"--microbuffer", [](const Use& u) { return u.cuts(); }, kDrawn},
+    {"--buffer-map", [](const Use& u) { return u.cuts(); }, kDrawn},
+    {"--splat", [](const Use& u) { return u.cuts(); }, kDrawn},
+    {"--clusters", [](const Use& u) { return u.Is(Integrator::kFpbgi); }, kFactorized},
+    {"--fill", [](const Use& u) { return u.Is(Integrator::kFpbgi); }, kFactorized},
+    {"--quality", [](const Use& u) { return u.quality(); },
+     "with --integrator fpbgi and adaptive clusters, and with irrcache where --cache-error or "
+     "--cache-samples is left to it"},
+    {"--cache-error", [](const Use& u) { return u.Is(Integrator::kIrrcache); }, kCaches},
+    {"--cache-samples", [](const Use& u) { return u.Is(Integrator::kIrrcache); }, kCaches},
+    {"--epsilon", [](const Use& u) { return u.far_and_near(); },
+     "with --integrator fpbgi, --clusters N and buffers filled by cuts"},
+};
+
 std::string Lower(std::string_view text) {
   std::string lower(text);
   for (char& c : lower) c = c >= 'A' && c <= 'Z' ? static_cast<char>(c - 'A' + 'a') : c;
@@ -549,6 +616,25 @@ absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec) {
   FP_RETURN_IF_ERROR(ResolveCameraFlags(edit));
   spec = std::move(edit.spec);
   return absl::OkStatus();
+}
+
+std::vector<std::string> IneffectiveFlags(std::span<const GivenFlag> given,
+                                          const RenderSettings& settings) {
+  const Use use(settings);
+  std::vector<std::string> lines;
+  for (const RenderFlag& flag : RenderFlags()) {
+    const bool is_given = std::any_of(given.begin(), given.end(),
+                                      [&](const GivenFlag& g) { return g.first == flag.name; });
+    if (!is_given) continue;
+    const auto rule = std::find_if(std::begin(kUseRules), std::end(kUseRules),
+                                   [&](const UseRule& r) { return r.flag == flag.name; });
+    if (rule == std::end(kUseRules) || rule->counts(use)) continue;
+    std::string line(flag.name);
+    line.append(" has no effect with ").append(rule->of_method ? use.method() : "--spp 1");
+    line.append("; it counts ").append(rule->where);
+    lines.push_back(std::move(line));
+  }
+  return lines;
 }
 
 bool IsJobFile(std::string_view path) { return Lower(path).ends_with(".json"); }

@@ -52,6 +52,11 @@ using GivenFlag = std::pair<std::string, std::string>;
 // this machine in overrides.environment->uri: PrepareRequest reads it.
 absl::Status ApplyRenderFlags(std::span<const GivenFlag> given, JobSpec& spec);
 
+// A line for each given flag that cannot matter under the settings that came of all flags: which,
+// why, and where it counts. In the order of RenderFlags().
+std::vector<std::string> IneffectiveFlags(std::span<const GivenFlag> given,
+                                          const RenderSettings& settings);
+
 // kInvalidArgument unless the name is that of a job file or of a scene format that is known.
 absl::Status CheckScenePath(std::string_view path);
 bool IsJobFile(std::string_view path);

@@ -287,6 +287,8 @@ std::string ComparisonJson(const CompareResult& result) {
       {"mse", result.mse},
       {"rel_rmse", OrNull(result.rel_rmse)},
       {"rr", OrNull(result.rr)},
+      {"noise", result.noise},
+      {"noise_above_error", result.noise_above_error},
       {"bias", OrNull(result.bias)},
       {"max_abs", result.max_abs},
       {"pdp", OrNull(result.pdp)},
@@ -301,6 +303,14 @@ std::string ComparisonJson(const CompareResult& result) {
       {"rect", {result.rect.x0, result.rect.y0, result.rect.x1, result.rect.y1}},
   };
   return Dump(json);
+}
+
+std::optional<std::string> ComparisonWarning(const CompareResult& result) {
+  if (!result.noise_above_error) return std::nullopt;
+  return Format(
+      "--noise %.6g is above the measured error, rel_rmse %.6g: rr is 0 and says only that the "
+      "error is below what the reference can show; take a reference with less noise",
+      result.noise, result.rel_rmse.value_or(0.0));
 }
 
 std::string ComparisonText(const CompareResult& result) {

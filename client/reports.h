@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <string>
 
@@ -58,9 +59,11 @@ std::string LogText(const JobEvent& event);
 // worker, state. Empty for a passing report.
 std::string LogJson(const JobEvent& event);
 
-// mse, rel_rmse, rr, bias, max_abs, pdp, flip, hash_equal and what they were taken over. null where
-// a measure does not exist.
+// mse, rel_rmse, rr, noise, noise_above_error, bias, max_abs, pdp, flip, hash_equal and what they
+// were taken over. null where a measure does not exist.
 std::string ComparisonJson(const CompareResult& result);
+// What a person should know of the result, if anything: that the noise is above the error.
+std::optional<std::string> ComparisonWarning(const CompareResult& result);
 std::string ComparisonText(const CompareResult& result);
 
 // What the header of a frame's image says: farpoint:version, :jobHash, :settings, the hash of the

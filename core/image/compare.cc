@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <set>
 
 #include "core/base/blob.h"
 #include "core/image/flip_metric.h"
@@ -60,18 +61,40 @@ Channels FindLayer(const ExrImage& image, const std::string& layer) {
   return found;
 }
 
-absl::Status NoSuchLayer(const ExrImage& image, const std::string& layer, const char* which) {
-  std::string names;
+// What --layer takes of an image: the layers of layers.h that it has, then prefixes of its other
+// channels, then channels without one.
+std::vector<std::string> LayersOf(const ExrImage& image) {
+  std::vector<std::string> names;
+  std::set<std::string_view> taken;
+  for (const LayerInfo& info : AllLayers()) {
+    // The beauty's fourth channel may be missing.
+    const Channels found =
+        FindAll(image, info.layer == Layer::kBeauty ? std::span(kRgb) : info.channels);
+    if (found.empty()) continue;
+    names.emplace_back(info.name);
+    taken.insert(info.channels.begin(), info.channels.end());
+  }
   for (const ExrChannel& channel : image.channels) {
+    if (taken.contains(channel.name)) continue;
+    const std::string name = channel.name.substr(0, channel.name.rfind('.'));
+    if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
+  }
+  return names;
+}
+
+absl::Status NoSuchLayer(const ExrImage& image, const std::string& layer,
+                         const std::string& which) {
+  std::string names;
+  for (const std::string& name : LayersOf(image)) {
     if (names.size() > 400) {
       names += ", …";
       break;
     }
-    names += (names.empty() ? "" : ", ") + channel.name;
+    names += (names.empty() ? "" : ", ") + name;
   }
-  return absl::InvalidArgumentError(std::string(which) + " has no layer '" +
-                                    (layer.empty() ? "R,G,B" : layer) + "'; its channels are " +
-                                    names);
+  return absl::InvalidArgumentError(which + " has no layer '" +
+                                    (IsBeauty(layer) ? "beauty' (R, G, B)" : layer + "'") +
+                                    (names.empty() ? "; it has none" : "; it has " + names));
 }
 
 // What CompareImages and WriteDiffPng work on.
@@ -107,14 +130,14 @@ absl::StatusOr<Pair> MakePair(const ExrImage& a, const ExrImage& b, const Compar
                                       RectText(b.data_window));
   }
   pair.a = FindLayer(a, options.layer);
-  if (pair.a.empty()) return NoSuchLayer(a, options.layer, "the image");
+  if (pair.a.empty()) return NoSuchLayer(a, options.layer, options.image_name);
   if (!options.ref_layer.empty()) {
     pair.b = FindLayer(b, options.ref_layer);
-    if (pair.b.empty()) return NoSuchLayer(b, options.ref_layer, "the reference");
+    if (pair.b.empty()) return NoSuchLayer(b, options.ref_layer, options.ref_name);
   } else {
     pair.b = FindLayer(b, options.layer);
     if (pair.b.empty()) pair.b = FindAll(b, kRgb);
-    if (pair.b.empty()) return NoSuchLayer(b, options.layer, "the reference");
+    if (pair.b.empty()) return NoSuchLayer(b, options.layer, options.ref_name);
   }
   if (pair.a.size() != pair.b.size()) {
     return absl::InvalidArgumentError(
@@ -131,16 +154,26 @@ absl::StatusOr<Pair> MakePair(const ExrImage& a, const ExrImage& b, const Compar
       return mask.rect.width() == r.width() && mask.rect.height() == r.height();
     };
     PixelRect at = mask.rect;
-    if (!at.Contains(pair.rect)) {
+    const bool of_frame = mask.frame_width == 0 || (mask.frame_width == b.frame_width &&
+                                                    mask.frame_height == b.frame_height);
+    if (!of_frame || !at.Contains(pair.rect)) {
       if (same_size(b.data_window)) {
         at = b.data_window;
       } else if (same_size(pair.rect)) {
         at = pair.rect;
       } else {
-        return absl::InvalidArgumentError("the mask of " + std::to_string(at.width()) + "x" +
-                                          std::to_string(at.height()) +
-                                          " pixels does not cover the compared pixels " +
-                                          RectText(pair.rect) + "; give one of the frame's size");
+        std::string what = "the mask of " + std::to_string(at.width()) + "x" +
+                           std::to_string(at.height()) + " pixels";
+        if (!of_frame && (mask.frame_width != at.width() || mask.frame_height != at.height())) {
+          what += " of a frame of " + std::to_string(mask.frame_width) + "x" +
+                  std::to_string(mask.frame_height);
+        }
+        return absl::InvalidArgumentError(
+            what +
+            (of_frame ? " does not cover the compared pixels " + RectText(pair.rect)
+                      : " is not of the images' frame") +
+            "; give one of the frame's size, " + std::to_string(b.frame_width) + "x" +
+            std::to_string(b.frame_height));
       }
     }
     if (mask.on.size() != static_cast<size_t>(mask.rect.area())) {
@@ -274,12 +307,16 @@ absl::StatusOr<PixelMask> ReadMask(const std::string& path) {
       return absl::InvalidArgumentError("the mask '" + path + "' has no channel");
     }
     mask.rect = image.data_window;
+    mask.frame_width = image.frame_width;
+    mask.frame_height = image.frame_height;
     for (const float v : image.channels.front().values) mask.on.push_back(v > 0.5f);
     return mask;
   }
   const absl::StatusOr<NpyArray2d> array = ReadNpy2d(path);
   if (!array.ok()) return Annotate(array.status(), "mask (.npy or .exr)");
   mask.rect = {0, 0, array->cols, array->rows};
+  mask.frame_width = array->cols;
+  mask.frame_height = array->rows;
   for (const double v : array->values) mask.on.push_back(v > 0.5);
   return mask;
 }
@@ -301,6 +338,7 @@ absl::StatusOr<CompareResult> CompareImages(const ExrImage& a, const ExrImage& b
   CompareResult result;
   result.rect = pair.rect;
   result.pixels = pair.pixels;
+  result.noise = options.noise;
   bool same_values = true;
   for (size_t c = 0; c < planes_a.size(); ++c) {
     same_values =
@@ -345,6 +383,7 @@ absl::StatusOr<CompareResult> CompareImages(const ExrImage& a, const ExrImage& b
   if (result.rel_rmse) {
     result.rr = std::sqrt(
         std::max(0.0, *result.rel_rmse * *result.rel_rmse - options.noise * options.noise));
+    result.noise_above_error = *result.rel_rmse < options.noise;
   }
 
   if (options.perceptual) {

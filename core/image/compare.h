@@ -16,9 +16,12 @@ namespace farpoint {
 struct PixelMask {
   PixelRect rect;           // in frame coordinates
   std::vector<uint8_t> on;  // height x width of rect, 0 or 1
+  // Of the frame that it was made for; 0: any that holds rect.
+  int frame_width = 0, frame_height = 0;
 };
 // A .npy array (height x width; see npy_io.h) or the first channel of an EXR: on where the value is
-// above 0.5. An array's first pixel is the frame's. Told apart by the file's first bytes.
+// above 0.5. An array's first pixel is the frame's, its size the frame's. Told apart by the file's
+// first bytes.
 absl::StatusOr<PixelMask> ReadMask(const std::string& path);
 
 struct CompareOptions {
@@ -27,10 +30,13 @@ struct CompareOptions {
   std::string layer;
   // The same in the reference. Empty: `layer`; if the reference does not have that, R, G and B.
   std::string ref_layer;
-  // Must cover the compared rectangle, or have its size, or that of the reference's data window.
+  // Must be of the images' frame and cover the compared rectangle, or have that rectangle's size,
+  // or that of the reference's data window.
   std::optional<PixelMask> mask;
   // The reference's own relative RMSE: standard error over mean.
   double noise = 0.0;
+  // What errors call the two.
+  std::string image_name = "the image", ref_name = "the reference";
   // `pdp` and `flip` take seconds per megapixel.
   bool perceptual = true;
 };
@@ -48,7 +54,10 @@ struct CompareResult {
   // Relative to the reference's mean; none if that is not positive and the images differ.
   std::optional<double> rel_rmse;  // sqrt(mse) / mean(b)
   std::optional<double> rr;        // sqrt(max(0, rel_rmse^2 - noise^2))
-  std::optional<double> bias;      // mean(a - b) / mean(b)
+  double noise = 0;                // CompareOptions::noise
+  // rel_rmse is below the noise: rr is 0 and says nothing, or the noise is overstated.
+  bool noise_above_error = false;
+  std::optional<double> bias;  // mean(a - b) / mean(b)
   // Counted pixels that differ perceptibly (yee_metric.h). Both images are divided by the 99th
   // percentile of the reference's luminance over the counted pixels and clamped to [0, 1]; the
   // frame's width spans 45 degrees. None unless asked for.
@@ -65,8 +74,8 @@ struct CompareResult {
   std::string hash_a, hash_b;
 };
 
-// kInvalidArgument: unknown layers (the message lists what the file has), frames or masks of other
-// sizes, nothing in common, nothing counted or nothing finite.
+// kInvalidArgument: unknown layers (the message names the image and the layers that it has), frames
+// or masks of other sizes, nothing in common, nothing counted or nothing finite.
 absl::StatusOr<CompareResult> CompareImages(const ExrImage& a, const ExrImage& b,
                                             const CompareOptions& options);
 

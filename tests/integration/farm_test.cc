@@ -367,6 +367,22 @@ TEST(Client, ComparesImages) {
   const RunResult unknown =
       farm.Client({"compare", farm.File("fpbgi.exr"), farm.File("pbgi.exr"), "--layer", "nothing"});
   EXPECT_EQ(unknown.exit_code, 42);
+  EXPECT_THAT(unknown.err, AllOf(HasSubstr(farm.File("fpbgi.exr")), HasSubstr("irradiance")));
+  const std::vector<std::string> noisy = {"compare",
+                                          farm.File("fpbgi.exr"),
+                                          farm.File("pbgi.exr"),
+                                          "--layer",
+                                          "irradiance",
+                                          "--noise",
+                                          "5",
+                                          "--json",
+                                          "-"};
+  const RunResult warned = farm.Client(noisy);
+  EXPECT_EQ(Json::parse(warned.out)["noise_above_error"], true);
+  EXPECT_THAT(warned.err, HasSubstr("warning: --noise 5"));
+  std::vector<std::string> quiet = noisy;
+  quiet.emplace_back("--quiet");
+  EXPECT_EQ(farm.Client(quiet).err, "");
 }
 
 }  // namespace

@@ -226,6 +226,8 @@ TEST(CommandLine, Compare) {
   EXPECT_EQ(line.diff, "d.png");
   EXPECT_THAT(Refusal({"compare", "a.exr"}), HasSubstr("two .exr"));
   EXPECT_THAT(Refusal({"compare", "a.exr", "b.exr", "--noise", "-1"}), StartsWith("--noise -1: "));
+  EXPECT_THAT(Refusal({"compare", "a.exr", "b.exr", "--diff", "d.jpg"}),
+              AllOf(StartsWith("--diff d.jpg: "), HasSubstr(".png")));
 }
 
 TEST(CommandLine, HelpAndVersionPrintAndNeedNothingElse) {

@@ -178,6 +178,20 @@ TEST_F(PrepareRequestTest, NotesWhatHasNoEffect) {
               ElementsAre(HasSubstr("no animation")));
 }
 
+TEST_F(PrepareRequestTest, WarnsOfFlagsThatCannotMatterInTheModeOfAllFlags) {
+  const std::string still = folder_.Write("scenes/still.gltf", R"({"asset": {"version": "2.0"}})");
+  EXPECT_THAT(Prepare(still, {{"--cache-error", "0.1"}})->warnings,
+              ElementsAre(HasSubstr("--cache-error")));
+  EXPECT_THAT(Prepare(still, {{"--cache-error", "0.1"}, {"--integrator", "irrcache"}})->warnings,
+              IsEmpty());
+  // A job file's settings count as the mode; its own are not warned of.
+  const std::string job = Job(
+      R"({"asset": {"root": "../scenes/a.gltf"}, "settings": {"integrator": "INTEGRATOR_PT", "points": 99}})");
+  EXPECT_THAT(Prepare(job)->warnings, IsEmpty());
+  EXPECT_THAT(Prepare(job, {{"--points", "99"}})->warnings,
+              ElementsAre(HasSubstr("--integrator pt")));
+}
+
 TEST_F(PrepareRequestTest, MissingFilesAreNamed) {
   EXPECT_THAT(FileError(folder_.File("none.gltf")), HasSubstr("none.gltf"));
   EXPECT_THAT(FileError(folder_.File("none.json")), HasSubstr("none.json"));

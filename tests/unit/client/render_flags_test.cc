@@ -11,6 +11,7 @@ namespace {
 using testing::AllOf;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::IsEmpty;
 using testing::StartsWith;
 
 JobSpec Apply(const std::vector<GivenFlag>& given, JobSpec spec = {}) {
@@ -332,6 +333,91 @@ TEST(CheckScenePath, KnowsItsExtensions) {
 TEST(IsJobFile, GoesByTheExtension) {
   EXPECT_TRUE(IsJobFile("x.JSON"));
   EXPECT_FALSE(IsJobFile("x.gltf"));
+}
+
+// What a user is warned of.
+std::vector<std::string> Ineffective(const std::vector<GivenFlag>& given) {
+  const JobSpec spec = Apply(given);
+  return IneffectiveFlags(given, spec.settings);
+}
+
+TEST(IneffectiveFlags, AreNoneWhereAllCount) {
+  EXPECT_THAT(Ineffective({}), IsEmpty());
+  EXPECT_THAT(Ineffective({{"--quality", "fine"},
+                           {"--points", "5"},
+                           {"--light-samples", "8"},
+                           {"--fill", "rays"},
+                           {"--clusters", "adaptive"},
+                           {"--seed", "2"}}),
+              IsEmpty());
+  EXPECT_THAT(Ineffective({{"--preset", "paper"},
+                           {"--epsilon", "0.2"},
+                           {"--microbuffer", "16"},
+                           {"--splat", "opaque"},
+                           {"--buffer-map", "octahedral"}}),
+              IsEmpty());
+  EXPECT_THAT(Ineffective({{"--fill", "cut"}, {"--microbuffer", "16"}, {"--quality", "draft"}}),
+              IsEmpty());
+  EXPECT_THAT(Ineffective({{"--integrator", "pbgi"},
+                           {"--microbuffer", "16"},
+                           {"--buffer-map", "cosine"},
+                           {"--preset", "paper"}}),
+              IsEmpty());
+  EXPECT_THAT(Ineffective({{"--integrator", "pt"},
+                           {"--paths", "5"},
+                           {"--spp", "4"},
+                           {"--filter", "box"},
+                           {"--filter-width", "1"}}),
+              IsEmpty());
+  EXPECT_THAT(
+      Ineffective({{"--integrator", "irrcache"}, {"--cache-error", "0.1"}, {"--quality", "fine"}}),
+      IsEmpty());
+}
+
+TEST(IneffectiveFlags, AreNamedWithTheModeInWhichTheyCount) {
+  struct Case {
+    GivenFlag flag;
+    std::vector<GivenFlag> mode;
+    const char *mode_text, *counts;
+  };
+  const std::vector<GivenFlag> pbgi = {{"--integrator", "pbgi"}}, pt = {{"--integrator", "pt"}},
+                               cache = {{"--integrator", "irrcache"}};
+  for (const Case& c : {
+           Case{{"--cache-error", "0.1"}, {}, "--integrator fpbgi", "--integrator irrcache"},
+           Case{{"--cache-samples", "99"}, {}, "--integrator fpbgi", "--integrator irrcache"},
+           Case{{"--paths", "9"}, {}, "--integrator fpbgi", "--integrator pt"},
+           Case{{"--fill", "rays"}, pbgi, "--integrator pbgi", "--integrator fpbgi"},
+           Case{{"--clusters", "9"}, pbgi, "--integrator pbgi", "--integrator fpbgi"},
+           Case{{"--epsilon", "0.1"}, pbgi, "--integrator pbgi", "--clusters N"},
+           Case{{"--epsilon", "0.1"},
+                {{"--clusters", "9"}, {"--fill", "rays"}},
+                "filled by rays",
+                "filled by cuts"},
+           Case{{"--epsilon", "0.1"}, {{"--fill", "cut"}}, "adaptive clusters", "--clusters N"},
+           Case{{"--microbuffer", "9"}, {}, "filled by rays", "--fill cut"},
+           Case{{"--splat", "opaque"}, {}, "filled by rays", "--fill cut"},
+           Case{{"--microbuffer", "9"},
+                {{"--clusters", "9"}, {"--fill", "rays"}},
+                "--clusters 9",
+                "--fill cut"},
+           Case{{"--quality", "fine"}, pt, "--integrator pt", "adaptive clusters"},
+           Case{{"--quality", "fine"}, {{"--clusters", "9"}}, "--clusters 9", "adaptive clusters"},
+           Case{{"--quality", "fine"},
+                {{"--integrator", "irrcache"}, {"--cache-error", "1"}, {"--cache-samples", "9"}},
+                "--cache-samples",
+                "left to it"},
+           Case{{"--points", "9"}, cache, "--integrator irrcache", "fpbgi, pbgi or dpbgi"},
+           Case{{"--points", "9"}, pt, "--integrator pt", "fpbgi, pbgi or dpbgi"},
+           Case{{"--preset", "paper"}, pt, "--integrator pt", "fpbgi, pbgi or dpbgi"},
+           Case{{"--filter", "box"}, {}, "--spp 1", "--spp 2"},
+       }) {
+    std::vector<GivenFlag> given = c.mode;
+    given.push_back(c.flag);
+    EXPECT_THAT(Ineffective(given),
+                ElementsAre(AllOf(StartsWith(c.flag.first + " has no effect with "),
+                                  HasSubstr(c.mode_text), HasSubstr(c.counts))))
+        << c.flag.first << " " << c.mode_text;
+  }
 }
 
 }  // namespace

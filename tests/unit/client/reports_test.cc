@@ -233,9 +233,19 @@ TEST(ComparisonJson, HasItsMeasuresAndNullForWhatDoesNotExist) {
   EXPECT_EQ(json["pdp"], 17);
   EXPECT_EQ(json["flip"], 0.02);
   EXPECT_EQ(json["hash_equal"], true);
+  EXPECT_EQ(json["noise"], 0);
+  EXPECT_EQ(json["noise_above_error"], false);
+  EXPECT_FALSE(ComparisonWarning(result).has_value());
+  result.noise = 0.75;
+  result.noise_above_error = true;
   result.rr.reset();
   json = Json::parse(ComparisonJson(result));
   EXPECT_TRUE(json["rr"].is_null());
+  EXPECT_EQ(json["noise"], 0.75);
+  EXPECT_EQ(json["noise_above_error"], true);
+  ASSERT_TRUE(ComparisonWarning(result).has_value());
+  EXPECT_NE(ComparisonWarning(result)->find("--noise 0.75"), std::string::npos);
+  EXPECT_NE(ComparisonWarning(result)->find("rel_rmse 0.5"), std::string::npos);
   EXPECT_NE(ComparisonText(result).find("hash       equal"), std::string::npos);
 }
 

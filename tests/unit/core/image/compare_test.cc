@@ -59,6 +59,10 @@ TEST(Compare, NoiseBeyondTheErrorLeavesZero) {
   CompareOptions options = NumericOnly();
   options.noise = 10;
   EXPECT_EQ(*CompareImages(Rgb16(1, 1, 1), Rgb16(2, 2, 2), options)->rr, 0.0);
+  EXPECT_TRUE(CompareImages(Rgb16(1, 1, 1), Rgb16(2, 2, 2), options)->noise_above_error);
+  options.noise = 0.25;  // of an error of 0.5
+  EXPECT_FALSE(CompareImages(Rgb16(1, 1, 1), Rgb16(2, 2, 2), options)->noise_above_error);
+  EXPECT_EQ(CompareImages(Rgb16(1, 1, 1), Rgb16(2, 2, 2), options)->noise, 0.25);
   options.noise = -1;
   EXPECT_FALSE(CompareImages(Rgb16(1, 1, 1), Rgb16(2, 2, 2), options).ok());
   options.noise = NAN;
@@ -148,7 +152,7 @@ TEST(Compare, APlainReferenceServesAnyLayer) {
   options.ref_layer = "irradiance";  // asked for by name, it must be there
   const absl::Status status = CompareImages(a, plain, options).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kInvalidArgument);
-  EXPECT_NE(status.message().find("R, G, B"), absl::string_view::npos) << status;
+  EXPECT_NE(status.message().find("it has beauty"), absl::string_view::npos) << status;
 }
 
 TEST(Compare, RefusesWhatDoesNotFit) {
@@ -213,6 +217,42 @@ TEST(Compare, OnlyMaskedPixelsCount) {
   EXPECT_FALSE(CompareImages(a, b, options).ok());
   options.mask = PixelMask{{0, 0, 16, 16}, std::vector<uint8_t>(255, 1)};
   EXPECT_FALSE(CompareImages(a, b, options).ok());
+}
+
+TEST(Compare, AMaskOfAnotherFrameIsRefused) {
+  const ExrImage a = Rgb16(1, 1, 1);
+  CompareOptions options = NumericOnly();
+  // It would cover the image, but its pixels are those of another one.
+  options.mask = PixelMask{{0, 0, 32, 20}, std::vector<uint8_t>(640, 1), 32, 20};
+  const absl::Status larger = CompareImages(a, a, options).status();
+  EXPECT_EQ(larger.code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_NE(larger.message().find("32x20"), absl::string_view::npos) << larger;
+  EXPECT_NE(larger.message().find("16x16"), absl::string_view::npos) << larger;
+  // The part of a larger frame that lies on the image, too.
+  options.mask = PixelMask{{0, 0, 20, 18}, std::vector<uint8_t>(360, 1), 32, 20};
+  const absl::Status part = CompareImages(a, a, options).status();
+  EXPECT_NE(part.message().find("32x20"), absl::string_view::npos) << part;
+  options.mask = PixelMask{{0, 0, 16, 16}, std::vector<uint8_t>(256, 1), 16, 16};
+  EXPECT_TRUE(CompareImages(a, a, options).ok());
+  // One of the crop's size is laid over the crop, whatever frame it says.
+  const ExrImage crop = Flat({4, 4, 8, 6}, 16, 16, {{"R", 1}, {"G", 1}, {"B", 1}});
+  options.mask = PixelMask{{0, 0, 4, 2}, std::vector<uint8_t>(8, 1), 4, 2};
+  EXPECT_EQ(CompareImages(crop, crop, options)->pixels, 8);
+}
+
+TEST(Compare, AnUnknownLayerIsRefusedWithTheLayersThatAreThere) {
+  const ExrImage a = Flat({0, 0, 2, 2}, 2, 2,
+                          {{"R", 1}, {"G", 1}, {"B", 1}, {"Z", 1}, {"mine.u", 1}, {"mine.v", 1}});
+  CompareOptions options = NumericOnly();
+  options.layer = "nope";
+  options.image_name = "a.exr";
+  options.ref_name = "b.exr";
+  EXPECT_EQ(CompareImages(a, a, options).status().message(),
+            "a.exr has no layer 'nope'; it has beauty, Z, mine");
+  options.layer = "beauty";
+  options.ref_layer = "gone";
+  EXPECT_EQ(CompareImages(a, a, options).status().message(),
+            "b.exr has no layer 'gone'; it has beauty, Z, mine");
 }
 
 TEST(Compare, AMaskOfTheCropsSizeIsLaidOverTheCrop) {
