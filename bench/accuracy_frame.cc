@@ -5,24 +5,15 @@
 
 namespace farpoint {
 
-namespace {
-
-double SumOf(const Stats& stats, std::initializer_list<Stage> stages) {
+double SumOf(const StageSeconds& seconds, std::span<const Stage> stages) {
   double sum = 0;
-  for (const Stage s : stages) sum += stats.seconds[static_cast<size_t>(s)];
+  for (const Stage s : stages) sum += seconds[static_cast<size_t>(s)];
   return sum;
 }
 
-}  // namespace
+double GatherSeconds(const Stats& stats) { return SumOf(stats.seconds, kGatherStages); }
 
-double GatherSeconds(const Stats& stats) {
-  return SumOf(stats, {Stage::kCluster, Stage::kCut, Stage::kRaster, Stage::kComposite,
-                       Stage::kConvolve, Stage::kTrace});
-}
-
-double BakeSeconds(const Stats& stats) {
-  return SumOf(stats, {Stage::kImport, Stage::kSample, Stage::kShade, Stage::kTree});
-}
+double BakeSeconds(const Stats& stats) { return SumOf(stats.seconds, kBakeStages); }
 
 RenderSettings MeasuredSettings(const AccuracyOptions& options) {
   RenderSettings settings;

@@ -1,7 +1,9 @@
 // One frame of the accuracy report: baked, loaded, rendered.
 #pragma once
 
+#include <array>
 #include <memory>
+#include <span>
 
 #include "bench/accuracy.h"
 #include "bench/sparse_reference.h"
@@ -11,6 +13,15 @@
 #include "core/render/bake.h"
 
 namespace farpoint {
+
+// Of what an integrator does for indirect light.
+inline constexpr std::array kGatherStages = {Stage::kCluster,   Stage::kCut,      Stage::kRaster,
+                                             Stage::kComposite, Stage::kConvolve, Stage::kTrace};
+// Of a bake.
+inline constexpr std::array kBakeStages = {Stage::kImport, Stage::kSample, Stage::kShade,
+                                           Stage::kTree};
+using StageSeconds = std::array<double, kStageCount>;
+double SumOf(const StageSeconds& seconds, std::span<const Stage> stages);
 
 // cluster + cut + raster + composite + convolve + trace, thread-seconds.
 double GatherSeconds(const Stats& stats);

@@ -8,6 +8,7 @@
 #include "bench/accuracy_pictures.h"
 #include "bench/text.h"
 #include "core/render/bake.h"
+#include "core/scene/quad_mesh.h"
 
 namespace farpoint {
 
@@ -15,23 +16,8 @@ namespace {
 
 constexpr double kRoomBar = 0.001, kWallBar = 0.005;
 
-void AddMesh(const char* name, int32_t material, const std::vector<std::array<Vec3f, 4>>& quads,
-             Scene& scene) {
-  Mesh mesh;
-  mesh.name = name;
-  mesh.material = material;
-  for (const auto& quad : quads) {
-    const auto first = static_cast<uint32_t>(mesh.positions.size());
-    mesh.positions.insert(mesh.positions.end(), quad.begin(), quad.end());
-    mesh.triangles.push_back({first, first + 1, first + 2});
-    mesh.triangles.push_back({first, first + 2, first + 3});
-  }
-  scene.instances.push_back({name, static_cast<uint32_t>(scene.meshes.size()), {}});
-  scene.meshes.push_back(std::move(mesh));
-}
-
 // The six sides of a box; surfaces are two-sided, so their order does not matter.
-std::vector<std::array<Vec3f, 4>> BoxQuads(const Vec3d& from, const Vec3d& to) {
+std::vector<Quad> BoxQuads(const Vec3d& from, const Vec3d& to) {
   const Vec3f a(from), b(to);
   return {{{{a.x, a.y, a.z}, {b.x, a.y, a.z}, {b.x, a.y, b.z}, {a.x, a.y, b.z}}},
           {{{a.x, b.y, a.z}, {a.x, b.y, b.z}, {b.x, b.y, b.z}, {b.x, b.y, a.z}}},
@@ -41,15 +27,6 @@ std::vector<std::array<Vec3f, 4>> BoxQuads(const Vec3d& from, const Vec3d& to) {
           {{{b.x, a.y, a.z}, {b.x, b.y, a.z}, {b.x, b.y, b.z}, {b.x, a.y, b.z}}}};
 }
 
-Material Lambert(const char* name, const Rgb& albedo, const Rgb& emission = {}) {
-  Material material;
-  material.name = name;
-  material.base_color = albedo;
-  material.emission = emission;
-  material.metallic = 0;
-  return material;
-}
-
 Camera MakeCamera(const char* name, const Vec3d& eye, const Vec3d& target) {
   Camera camera = CameraOf({eye, target, 75}).value();  // never straight up or down
   camera.name = name;
@@ -57,7 +34,7 @@ Camera MakeCamera(const char* name, const Vec3d& eye, const Vec3d& target) {
 }
 
 // A wall between x0 and x1, y0 and y1, z0 and z1, or, if one of them is nothing, a quad.
-std::vector<std::array<Vec3f, 4>> WallQuads(const Vec3d& from, const Vec3d& to) {
+std::vector<Quad> WallQuads(const Vec3d& from, const Vec3d& to) {
   const Vec3f a(from), b(to);
   if (a.x == b.x) return {{{{a.x, a.y, a.z}, {a.x, b.y, a.z}, {a.x, b.y, b.z}, {a.x, a.y, b.z}}}};
   if (a.y == b.y) return {{{{a.x, a.y, a.z}, {b.x, a.y, a.z}, {b.x, a.y, b.z}, {a.x, a.y, b.z}}}};
@@ -101,13 +78,13 @@ absl::StatusOr<Lit> Irradiance(const LoadedFrame& loaded, const Camera& camera,
 Scene MakeDarkRoom(double t) {
   Scene scene;
   scene.name = "dark room";
-  scene.materials = {Lambert("plaster", Rgb(0.8f)), Lambert("ground", Rgb(0.5f)),
-                     Lambert("bricks", Rgb(0.7f, 0.4f, 0.3f))};
-  AddMesh("ground", 1, {{{{-20, 0, -20}, {-20, 0, 20}, {20, 0, 20}, {20, 0, -20}}}}, scene);
+  scene.materials = {LambertMaterial("plaster", Rgb(0.8f)), LambertMaterial("ground", Rgb(0.5f)),
+                     LambertMaterial("bricks", Rgb(0.7f, 0.4f, 0.3f))};
+  AddQuads("ground", 1, {{{{-20, 0, -20}, {-20, 0, 20}, {20, 0, 20}, {20, 0, -20}}}}, scene);
   // The walls reach through each other, so that no crack is left; floor and ceiling too.
   const double half = 2, height = 3;
   const double out = half + t;
-  std::vector<std::array<Vec3f, 4>> walls;
+  std::vector<Quad> walls;
   const auto wall = [&](const Vec3d& from, const Vec3d& to) {
     for (const auto& quad : WallQuads(from, to)) walls.push_back(quad);
   };
@@ -119,8 +96,8 @@ Scene MakeDarkRoom(double t) {
   wall({-out - lap, low - 0.005, half}, {out + lap, high + lap, out});
   wall({-out - lap, high, -out - lap}, {out + lap, high + t, out + lap});
   wall({-out - lap, low, -out - lap}, {out + lap, low, out + lap});
-  AddMesh("room", 0, walls, scene);
-  AddMesh("neighbour", 2, BoxQuads({4, 0, -4}, {8, 5, 4}), scene);
+  AddQuads("room", 0, walls, scene);
+  AddQuads("neighbour", 2, BoxQuads({4, 0, -4}, {8, 5, 4}), scene);
   PunctualLight sun;
   sun.name = "sun";
   sun.kind = PunctualKind::kDirectional;
@@ -136,12 +113,13 @@ Scene MakeDarkRoom(double t) {
 Scene MakeSplitRoom(double t) {
   Scene scene;
   scene.name = "split room";
-  scene.materials = {Lambert("plaster", Rgb(0.8f)), Lambert("lamp", Rgb(0.0f), Rgb(10, 10, 9))};
-  AddMesh("box", 0, BoxQuads({-4, 0, -2}, {4, 3, 2}), scene);
+  scene.materials = {LambertMaterial("plaster", Rgb(0.8f)),
+                     LambertMaterial("lamp", Rgb(0.0f), Rgb(10, 10, 9))};
+  AddQuads("box", 0, BoxQuads({-4, 0, -2}, {4, 3, 2}), scene);
   // Into the box's walls, so that no crack is left.
-  AddMesh("wall", 0, WallQuads({-0.5 * t, -0.05, -2.05}, {0.5 * t, 3.05, 2.05}), scene);
-  AddMesh("lamp", 1, {{{{2, 2.9f, -0.5f}, {3, 2.9f, -0.5f}, {3, 2.9f, 0.5f}, {2, 2.9f, 0.5f}}}},
-          scene);
+  AddQuads("wall", 0, WallQuads({-0.5 * t, -0.05, -2.05}, {0.5 * t, 3.05, 2.05}), scene);
+  AddQuads("lamp", 1, {{{{2, 2.9f, -0.5f}, {3, 2.9f, -0.5f}, {3, 2.9f, 0.5f}, {2, 2.9f, 0.5f}}}},
+           scene);
   scene.cameras = {MakeCamera("dark", {-3.6, 1.6, -1.2}, {0, 1.4, 0.3}),
                    MakeCamera("lit", {3.6, 1.6, -1.2}, {0, 1.4, 0.3})};
   return scene;

@@ -1,22 +1,14 @@
 #include "bench/accuracy_scenes.h"
 
-#include <algorithm>
-#include <cmath>
 #include <filesystem>
 #include <utility>
 
 #include "absl/strings/str_format.h"
-#include "bench/bench_scene.h"
 #include "bench/text.h"
-#include "core/math/elementary.h"
-#include "core/scene/asset.h"
-#include "core/scene/importer.h"
 
 namespace farpoint {
 
 namespace {
-
-constexpr double kDegree = kPi / 180.0;
 
 std::string TripleText(double x, double y, double z) {
   return absl::StrFormat("%g,%g,%g", x, y, z);
@@ -116,30 +108,11 @@ std::string CommandOf(const AccuracyCase& c) {
   return text;
 }
 
-absl::StatusOr<Camera> CameraOf(const AccuracyView& view) {
-  const Vec3d forward = view.target - view.eye;
-  const Vec3d right = Cross(forward, Vec3d(0, 1, 0));
-  if (!(Length2(right) > 0.0)) {
-    return absl::InvalidArgumentError("the camera looks straight up or down, or at itself");
-  }
-  Camera camera;
-  camera.eye = view.eye;
-  camera.forward = Normalize(forward);
-  camera.right = Normalize(right);
-  camera.up = Cross(camera.right, camera.forward);
-  camera.yfov_rad = view.yfov_deg * kDegree;
-  return camera;
-}
-
 absl::StatusOr<std::optional<AccuracyScene>> LoadAccuracyScene(const AccuracyCase& c,
                                                                const AccuracyFolders& folders,
                                                                bool quick, std::string& missing) {
-  AccuracyScene loaded;
-  if (IsOwn(c.scene)) {
-    FP_ASSIGN_OR_RETURN(BenchScene own, MakeBenchScene(c.scene, quick));
-    loaded.scene = std::move(own.scene);
-    loaded.notes = std::move(own.notes);
-  } else {
+  std::string source = c.scene;
+  if (!IsOwn(c.scene)) {
     const bool published = c.truth == TruthKind::kPublished;
     const std::string& folder = published ? folders.references : folders.scenes;
     if (folder.empty()) {
@@ -147,33 +120,17 @@ absl::StatusOr<std::optional<AccuracyScene>> LoadAccuracyScene(const AccuracyCas
                         published ? "--references" : "--scenes"});
       return std::nullopt;
     }
-    const std::filesystem::path path = std::filesystem::path(folder) / c.scene;
+    source = (std::filesystem::path(folder) / c.scene).string();
     std::error_code error;
-    if (!std::filesystem::exists(path, error)) {
-      missing = path.string() + " is not there";
+    if (!std::filesystem::exists(source, error)) {
+      missing = source + " is not there";
       return std::nullopt;
     }
-    FP_ASSIGN_OR_RETURN(const AssetBundle asset, CollectAsset(path.string()));
-    FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, ImportOptions()));
-    EnsureCameraAndLight(imported, /*light_chosen=*/c.sun.has_value() || c.sky.has_value());
-    loaded.scene = std::move(imported.scene);
-    loaded.notes = std::move(imported.notes);
   }
-  Scene& scene = loaded.scene;
-  if (c.sun) {
-    PunctualLight sun;
-    sun.name = "sun 0";
-    sun.kind = PunctualKind::kDirectional;
-    sun.direction = -NormalizeOr(c.sun->to_sun, Vec3d(0, 1, 0));
-    sun.intensity = c.sun->irradiance;
-    scene.lights = {std::move(sun)};
-  }
-  if (c.sky) scene.environment.sky = *c.sky;
-  if (c.view) {
-    FP_ASSIGN_OR_RETURN(loaded.camera, CameraOf(*c.view));
-  } else {
-    loaded.camera = scene.cameras.front();
-  }
+  FP_ASSIGN_OR_RETURN(BenchScene made,
+                      MakeBenchScene(source, quick, {.sun = c.sun, .sky = c.sky, .view = c.view}));
+  AccuracyScene loaded{std::move(made.scene), {}, std::move(made.notes)};
+  loaded.camera = loaded.scene.cameras.front();
   return std::optional<AccuracyScene>(std::move(loaded));
 }
 

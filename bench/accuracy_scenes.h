@@ -6,6 +6,7 @@
 #include <string_view>
 #include <vector>
 
+#include "bench/bench_scene.h"
 #include "core/base/status.h"
 #include "core/scene/scene.h"
 
@@ -16,17 +17,6 @@ enum class TruthKind {
   kTraced,     // by pt, at some of the pixels
   kPublished,  // an EXR and a mask beside the scene file, whole frame
   kFurnace,    // closed form: direct irradiance pi L, indirect pi rho L
-};
-
-struct AccuracySun {
-  Vec3d to_sun;    // towards the sun, any length > 0
-  Rgb irradiance;  // on a facing surface, W/m²
-};
-
-// A free camera, as by --eye, --target and --fov of `farpoint render`; up is +y.
-struct AccuracyView {
-  Vec3d eye, target;  // world, metres
-  double yfov_deg = 0;
 };
 
 struct AccuracyCase {
@@ -52,9 +42,6 @@ absl::StatusOr<AccuracyCase> FindAccuracyCase(std::string_view name, bool quick)
 
 // The flags of `farpoint render` that make the same frame.
 std::string CommandOf(const AccuracyCase& c);
-
-// +y is up; `view` is checked: eye and target differ, not above each other.
-absl::StatusOr<Camera> CameraOf(const AccuracyView& view);
 
 struct AccuracyFolders {
   std::string scenes;      // of others; empty: none

@@ -2,6 +2,7 @@
 
 #include <utility>
 
+#include "core/math/elementary.h"
 #include "core/scene/asset.h"
 #include "core/scene/importer.h"
 #include "core/scene/procedural.h"
@@ -28,7 +29,24 @@ absl::StatusOr<BenchScene> Load(const std::string& name_or_path, bool small,
   return BenchScene{std::move(imported.scene), std::move(imported.notes)};
 }
 
+constexpr double kDegree = kPi / 180.0;
+
 }  // namespace
+
+absl::StatusOr<Camera> CameraOf(const AccuracyView& view) {
+  const Vec3d forward = view.target - view.eye;
+  const Vec3d right = Cross(forward, Vec3d(0, 1, 0));
+  if (!(Length2(right) > 0.0)) {
+    return absl::InvalidArgumentError("the camera looks straight up or down, or at itself");
+  }
+  Camera camera;
+  camera.eye = view.eye;
+  camera.forward = Normalize(forward);
+  camera.right = Normalize(right);
+  camera.up = Cross(camera.right, camera.forward);
+  camera.yfov_rad = view.yfov_deg * kDegree;
+  return camera;
+}
 
 absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool small,
                                           const SceneChanges& changes) {
@@ -36,7 +54,7 @@ absl::StatusOr<BenchScene> MakeBenchScene(const std::string& name_or_path, bool 
   Scene& scene = made.scene;
   if (changes.sun) {
     PunctualLight sun;
-    sun.name = "sun";
+    sun.name = "sun 0";
     sun.kind = PunctualKind::kDirectional;
     sun.direction = -NormalizeOr(changes.sun->to_sun, Vec3d(0, 1, 0));
     sun.intensity = changes.sun->irradiance;

@@ -5,11 +5,24 @@
 #include <string>
 #include <vector>
 
-#include "bench/accuracy_scenes.h"
 #include "core/base/status.h"
 #include "core/scene/scene.h"
 
 namespace farpoint {
+
+struct AccuracySun {
+  Vec3d to_sun;    // towards the sun, any length > 0
+  Rgb irradiance;  // on a facing surface, W/m²
+};
+
+// A free camera, as by --eye, --target and --fov of `farpoint render`; up is +y.
+struct AccuracyView {
+  Vec3d eye, target;  // world, metres
+  double yfov_deg = 0;
+};
+
+// +y is up; `view` is checked: eye and target differ, not above each other.
+absl::StatusOr<Camera> CameraOf(const AccuracyView& view);
 
 struct BenchScene {
   Scene scene;
@@ -17,7 +30,7 @@ struct BenchScene {
   std::vector<std::string> notes;
 };
 
-// In place of what the scene has.
+// In place of what the scene has, own scenes included.
 struct SceneChanges {
   std::optional<AccuracySun> sun;    // of its punctual lights
   std::optional<Rgb> sky;            // W/(m² sr)

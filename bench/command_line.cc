@@ -7,6 +7,7 @@
 #include <cstdlib>
 #include <string_view>
 
+#include "absl/strings/str_join.h"
 #include "bench/text.h"
 
 namespace farpoint {
@@ -98,7 +99,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   pareto->add_option("--mask", p.mask_path, "EXR or .npy of the pixels that count [all that hit]");
   pareto
       ->add_option("--reference-paths", p.reference_paths,
-                   "Paths per pixel of the traced reference [8192, quick: 2048]")
+                   "Paths per pixel of the traced reference, in two halves [8192, quick: 2048]")
       ->excludes(reference)
       ->check(CLI::Range(8u, 1u << 20));
   std::string pareto_sun, pareto_sky, eye, target;
@@ -277,14 +278,21 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   const absl::StatusOr<Fill> asked_fill = FillFromName(fill);
   if (!asked_fill.ok()) return Annotate(asked_fill.status(), "--fill");
   a.fill = *asked_fill;
+  const std::vector<std::string> known_cases = AccuracyNames(a.quick);
+  for (const std::string& name : a.cases) {
+    if (std::find(known_cases.begin(), known_cases.end(), name) == known_cases.end()) {
+      return absl::InvalidArgumentError(
+          Concat({"--case ", name, " is none of ", absl::StrJoin(known_cases, ", "),
+                  a.quick ? " (those of --quick)" : ""}));
+    }
+  }
+  if (!w.scene.empty()) FP_RETURN_IF_ERROR(FindPaperScene(w.scene).status());
   r.cache_bytes = cache_mib << 20;
   if (!sun.empty()) {
-    FP_ASSIGN_OR_RETURN(const AccuracySun parsed, ParseSun(sun));
-    r.to_sun = parsed.to_sun;
-    r.sun = parsed.irradiance;
+    FP_ASSIGN_OR_RETURN(r.changes.sun, ParseSun(sun));
   }
   if (!sky.empty()) {
-    FP_ASSIGN_OR_RETURN(r.sky, ParseSky(sky));
+    FP_ASSIGN_OR_RETURN(r.changes.sky, ParseSky(sky));
   }
   if (!pareto_sun.empty()) {
     FP_ASSIGN_OR_RETURN(p.changes.sun, ParseSun(pareto_sun));

@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "absl/strings/str_format.h"
+#include "bench/accuracy_frame.h"
 #include "bench/machine.h"
 #include "bench/sparse_reference.h"
 #include "bench/text.h"
@@ -27,8 +28,6 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array kGatherStages = {Stage::kCluster,   Stage::kCut,      Stage::kRaster,
-                                      Stage::kComposite, Stage::kConvolve, Stage::kTrace};
 constexpr int kSampleSide = 8;           // pixels of a sampled block
 constexpr int kCellSide = 4;             // pixels of a cell with one pixel of the reference
 constexpr float kDifferenceScale = 16;   // of difference images
@@ -66,11 +65,6 @@ PaperOptions InForce(PaperOptions o) {
   return o;
 }
 
-double GatherSeconds(const std::array<double, kStageCount>& seconds) {
-  double sum = 0;
-  for (const Stage s : kGatherStages) sum += seconds[static_cast<size_t>(s)];
-  return sum;
-}
 double SecondsOf(const Stats& stats, Stage stage) {
   return stats.seconds[static_cast<size_t>(stage)];
 }
@@ -79,7 +73,7 @@ PaperTimes TimesOf(const Stats& stats) {
   for (const Stage s : kGatherStages) {
     times.seconds[static_cast<size_t>(s)] = SecondsOf(stats, s);
   }
-  times.gather = GatherSeconds(times.seconds);
+  times.gather = GatherSeconds(stats);
   return times;
 }
 
@@ -343,7 +337,7 @@ class SceneRun {
     std::vector<double> gather, receivers;
     for (const std::optional<TileOutput>& out : outputs) {
       sum += out->stats;
-      gather.push_back(GatherSeconds(out->stats.seconds));
+      gather.push_back(GatherSeconds(out->stats));
       receivers.push_back(static_cast<double>(out->stats.counts.at("receivers")));
       if (film != nullptr) film->Paste(out->film);
     }
@@ -365,7 +359,7 @@ class SceneRun {
   absl::StatusOr<Film> RenderCrop(const RenderSettings& settings, double& gather) const {
     FP_ASSIGN_OR_RETURN(const auto renderer, Renderer(settings));
     FP_ASSIGN_OR_RETURN(TileOutput out, renderer->RenderTile(report_.crop, executor_, {}, nullptr));
-    gather = GatherSeconds(out.stats.seconds);
+    gather = GatherSeconds(out.stats);
     return std::move(out.film);
   }
 

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "absl/strings/str_format.h"
+#include "bench/accuracy_frame.h"
 #include "bench/html_page.h"
 #include "bench/svg_plot.h"
 #include "bench/text.h"
@@ -28,13 +29,7 @@ double Shared(const PaperSceneReport& s) { return s.primary_s + s.direct_s; }
 double Total(const PaperSceneReport& s, const PaperIntegrator& r) {
   return Shared(s) + r.times.gather;
 }
-double Preparation(const PaperSceneReport& s) {
-  double sum = 0;
-  for (const Stage stage : {Stage::kImport, Stage::kSample, Stage::kShade, Stage::kTree}) {
-    sum += s.preparation[static_cast<size_t>(stage)];
-  }
-  return sum;
-}
+double Preparation(const PaperSceneReport& s) { return SumOf(s.preparation, kBakeStages); }
 double PerMillion(int64_t count, double of) { return Ratio(1e6 * static_cast<double>(count), of); }
 double Compared(const PaperSceneReport& s) { return static_cast<double>(s.compared.area()); }
 double PaperPixels(const PaperSceneReport& s) {
@@ -329,8 +324,7 @@ Json ToJson(const PixelRect& r) { return Json::array({r.x0, r.y0, r.x1, r.y1}); 
 
 Json ToJson(const PaperSceneReport& s, const PaperIntegrator& r) {
   Json seconds;
-  for (const Stage stage : {Stage::kCluster, Stage::kCut, Stage::kRaster, Stage::kComposite,
-                            Stage::kConvolve, Stage::kTrace}) {
+  for (const Stage stage : kGatherStages) {
     seconds[kStageNames[static_cast<size_t>(stage)]] = At(r.times, stage);
   }
   seconds["gather"] = r.times.gather;
@@ -357,7 +351,7 @@ Json ToJson(const PaperSceneReport& s, const PaperIntegrator& r) {
 Json ToJson(const PaperSceneReport& s) {
   const PublishedRow& p = s.scene.published;
   Json preparation;
-  for (const Stage stage : {Stage::kImport, Stage::kSample, Stage::kShade, Stage::kTree}) {
+  for (const Stage stage : kBakeStages) {
     preparation[kStageNames[static_cast<size_t>(stage)]] =
         s.preparation[static_cast<size_t>(stage)];
   }

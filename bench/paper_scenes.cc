@@ -7,6 +7,7 @@
 
 #include "bench/accuracy_scenes.h"
 #include "bench/text.h"
+#include "core/scene/quad_mesh.h"
 
 namespace farpoint {
 
@@ -74,29 +75,13 @@ Box BoundsOf(const Scene& scene) {
 }
 
 int32_t AddMaterial(Scene& scene, const char* name, const Rgb& albedo) {
-  Material material;
-  material.name = name;
-  material.base_color = albedo;
-  material.metallic = 0;
-  scene.materials.push_back(std::move(material));
+  scene.materials.push_back(LambertMaterial(name, albedo));
   return static_cast<int32_t>(scene.materials.size()) - 1;
 }
 
 // A parallelogram of corner and two edges.
-void AddQuad(Scene& scene, const char* name, int32_t material, const Vec3d& corner, const Vec3d& u,
-             const Vec3d& v) {
-  Mesh mesh;
-  mesh.name = name;
-  mesh.material = material;
-  for (const Vec3d& p : {corner, corner + u, corner + u + v, corner + v}) {
-    mesh.positions.push_back(Vec3f(p));
-  }
-  mesh.triangles = {{0, 1, 2}, {0, 2, 3}};
-  Instance instance;
-  instance.name = name;
-  instance.mesh = static_cast<uint32_t>(scene.meshes.size());
-  scene.meshes.push_back(std::move(mesh));
-  scene.instances.push_back(std::move(instance));
+Quad Parallelogram(const Vec3d& corner, const Vec3d& u, const Vec3d& v) {
+  return {Vec3f(corner), Vec3f(corner + u), Vec3f(corner + u + v), Vec3f(corner + v)};
 }
 
 // Floor, back and two coloured walls about what the scene holds; all lengths follow its height.
@@ -111,10 +96,10 @@ void AddRoom(Scene& scene) {
   const double z0 = middle.z - 1.0 * h, z1 = middle.z + 1.5 * h;
   const double y = box.low.y;
   const Vec3d across(x1 - x0, 0, 0), up(0, 1.9 * h, 0), along(0, 0, z1 - z0);
-  AddQuad(scene, "floor", grey, {x0, y, z0}, along, across);
-  AddQuad(scene, "back", grey, {x0, y, z0}, across, up);
-  AddQuad(scene, "left", red, {x0, y, z0}, up, along);
-  AddQuad(scene, "right", green, {x1, y, z0}, along, up);
+  AddQuads("floor", grey, {Parallelogram({x0, y, z0}, along, across)}, scene);
+  AddQuads("back", grey, {Parallelogram({x0, y, z0}, across, up)}, scene);
+  AddQuads("left", red, {Parallelogram({x0, y, z0}, up, along)}, scene);
+  AddQuads("right", green, {Parallelogram({x1, y, z0}, along, up)}, scene);
 }
 
 AccuracyCase CaseOf(const PaperScene& scene) {

@@ -10,11 +10,13 @@
 #include "bench/accuracy_frame.h"
 #include "bench/bench_scene.h"
 #include "bench/machine.h"
+#include "bench/sparse_reference.h"
 #include "bench/text.h"
 #include "core/base/clock.h"
 #include "core/base/executor.h"
 #include "core/image/compare.h"
 #include "core/image/exr_io.h"
+#include "core/math/sampling.h"
 #include "core/render/bake.h"
 #include "core/render/frame_renderer.h"
 
@@ -22,8 +24,6 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array kPreparationStages = {Stage::kImport, Stage::kSample, Stage::kShade,
-                                           Stage::kTree};
 // Any other number would do: see RunPareto.
 constexpr uint64_t kReferenceSeedOffset = 0x9e3779b97f4a7c15ull;
 constexpr double kLimitedByNoise = 2.0;
@@ -121,6 +121,7 @@ struct Reference {
   ExrImage image;
   PixelMask mask;
   std::optional<double> noise;
+  uint32_t paths = 0;  // of all halves
   double seconds = 0;
 };
 
@@ -131,42 +132,57 @@ PixelMask HitMask(const Film& film) {
   return mask;
 }
 
-// sqrt(mean(se²)) / mean(E) over the mask; none if the mean is not positive.
-std::optional<double> RelativeNoise(const Film& film, const PixelMask& mask) {
-  double sum_e = 0, sum_var = 0;
-  int64_t n = 0;
-  for (int y = film.rect().y0; y < film.rect().y1; ++y) {
-    for (int x = film.rect().x0; x < film.rect().x1; ++x) {
-      if (!mask.rect.Contains(x, y)) continue;
+// Whether each of the film's pixels counts. The mask holds the film.
+std::vector<uint8_t> OnFilm(const PixelMask& mask, const PixelRect& rect) {
+  std::vector<uint8_t> on;
+  for (int y = rect.y0; y < rect.y1; ++y) {
+    for (int x = rect.x0; x < rect.x1; ++x) {
       const int64_t at = int64_t{y - mask.rect.y0} * mask.rect.width() + (x - mask.rect.x0);
-      if (mask.on[static_cast<size_t>(at)] == 0) continue;
-      for (int c = 0; c < 3; ++c) {
-        const double se = film.Get(Layer::kStdError, c, x, y);
-        sum_e += film.Get(Layer::kIrradiance, c, x, y);
-        sum_var += se * se;
-        ++n;
-      }
+      on.push_back(mask.on[static_cast<size_t>(at)]);
     }
   }
-  if (n == 0 || !(sum_e > 0)) return std::nullopt;
-  const double count = static_cast<double>(n);
-  return std::sqrt(sum_var / count) / (sum_e / count);
+  return on;
+}
+
+std::vector<Rgb> IrradianceOf(const Film& film) {
+  std::vector<Rgb> values;
+  for (int y = film.rect().y0; y < film.rect().y1; ++y) {
+    for (int x = film.rect().x0; x < film.rect().x1; ++x) {
+      values.push_back({film.Get(Layer::kIrradiance, 0, x, y),
+                        film.Get(Layer::kIrradiance, 1, x, y),
+                        film.Get(Layer::kIrradiance, 2, x, y)});
+    }
+  }
+  return values;
 }
 
 absl::StatusOr<Reference> TraceReference(const FrameSetup& frame, const ParetoOptions& options,
                                          std::optional<PixelMask> mask) {
   RenderSettings settings;
   settings.integrator = Integrator::kPt;
-  settings.paths = options.reference_paths;
-  settings.seed = options.seed + kReferenceSeedOffset;
-  settings.layers = {Layer::kIrradiance, Layer::kStdError, Layer::kDepth};
-  FP_ASSIGN_OR_RETURN(const auto renderer, MakeRenderer(frame, settings));
-  FP_ASSIGN_OR_RETURN(const TileOutput out, RenderFrame(frame, *renderer));
+  settings.paths = options.reference_paths / 2;
+  settings.layers = {Layer::kIrradiance, Layer::kDepth};
   Reference reference;
-  reference.mask = mask ? *std::move(mask) : HitMask(out.film);
-  reference.noise = RelativeNoise(out.film, reference.mask);
-  reference.seconds = GatherSeconds(out.stats);
-  reference.image = ImageOf(out.film, frame.film);
+  std::vector<Film> films;
+  std::vector<Rgb> half[2];
+  for (uint64_t h = 0; h < 2; ++h) {
+    settings.seed = HashKey(options.seed + kReferenceSeedOffset, h);
+    FP_ASSIGN_OR_RETURN(const auto renderer, MakeRenderer(frame, settings));
+    FP_ASSIGN_OR_RETURN(TileOutput out, RenderFrame(frame, *renderer));
+    reference.paths += settings.paths;
+    reference.seconds += GatherSeconds(out.stats);
+    half[h] = IrradianceOf(out.film);
+    films.push_back(std::move(out.film));
+  }
+  reference.mask = mask ? *std::move(mask) : HitMask(films[0]);
+  const std::vector<uint8_t> on = OnFilm(reference.mask, films[0].rect());
+  reference.noise = NoiseOfHalves(on, half[0], half[1]);
+  for (int c = 0; c < 3; ++c) {
+    const std::span<float> mean = films[0].Plane(Layer::kIrradiance, c);
+    const std::span<const float> other = films[1].Plane(Layer::kIrradiance, c);
+    for (size_t i = 0; i < mean.size(); ++i) mean[i] = 0.5f * (mean[i] + other[i]);
+  }
+  reference.image = ImageOf(films[0], frame.film);
   return reference;
 }
 
@@ -267,9 +283,7 @@ absl::StatusOr<Baked> BakeRepeatedly(const Scene& scene, const RenderSettings& s
       return absl::InternalError("two bakes of one scene differ; this is a defect of farpoint");
     }
     samples.Add(stats.seconds);
-    double total = 0;
-    for (const Stage s : kPreparationStages) total += stats.seconds[static_cast<int>(s)];
-    totals.push_back(total);
+    totals.push_back(BakeSeconds(stats));
     baked.blobs = std::move(blobs);
     baked.stats = std::move(stats);
   }
@@ -342,6 +356,19 @@ std::string LabelOf(const ParetoPoint& p) {
       break;
   }
   return absl::StrFormat("%d paths", p.paths);
+}
+
+std::optional<std::string> NoiseWarning(const ParetoReport& report) {
+  std::string labels;
+  for (const ParetoPoint& p : report.points) {
+    if (!p.noise_above_error) continue;
+    Append(labels, {labels.empty() ? "" : ", ", NameOf(p.curve()), " ", LabelOf(p)});
+  }
+  if (labels.empty()) return std::nullopt;
+  return absl::StrFormat(
+      "the reference's noise of %.4g is above the error of %s: their rr is 0 and says only that "
+      "the error is below what the reference can show; take one with less noise",
+      report.reference_noise, labels);
 }
 
 void AnalysePoints(std::span<ParetoPoint> points) {
@@ -417,10 +444,12 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
                                      ErrorOptions(options, std::nullopt, 0.0));
     if (!tried.ok()) return Annotate(tried.status(), options.reference_path);
   }
-  if (mask && !mask->rect.Contains(frame_rect)) {
+  if (mask && (mask->frame_width != options.width || mask->frame_height != options.height ||
+               !mask->rect.Contains(frame_rect))) {
     return absl::InvalidArgumentError(absl::StrFormat(
-        "%s has %dx%d pixels and does not cover the frame of %dx%d", options.mask_path,
-        mask->rect.width(), mask->rect.height(), options.width, options.height));
+        "%s has %dx%d pixels of a frame of %dx%d and is no mask of the frame of %dx%d",
+        options.mask_path, mask->rect.width(), mask->rect.height(), mask->frame_width,
+        mask->frame_height, options.width, options.height));
   }
 
   FP_ASSIGN_OR_RETURN(BenchScene source,
@@ -477,6 +506,7 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
   report.reference_noise = reference.noise.value_or(0.0);
   report.reference_noise_known = reference.noise.has_value();
   report.reference_seconds = reference.seconds;
+  if (!reference_file) options.reference_paths = reference.paths;
 
   report.points = Configurations(SweepOf(options.quick));
   if (!options.curves.empty()) {
@@ -522,6 +552,7 @@ absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& asked,
       point.rr = *result->rr;
       point.bias = *result->bias;
       point.reference_limited = point.rel_rmse < kLimitedByNoise * report.reference_noise;
+      point.noise_above_error = result->noise_above_error;
       report.compared_pixels = static_cast<uint64_t>(result->pixels - result->left_out);
       report.reference_mean = result->ref_mean;
     }

@@ -36,7 +36,7 @@ struct ParetoOptions {
   std::string ref_layer;            // of the file: its "irradiance" or, without one, R, G and B
   std::string mask_path;            // see ReadMask; empty: the pixels whose primary ray hits
   std::optional<double> noise;      // the file's standard error over its mean; none: unknown, as 0
-  uint32_t reference_paths = 0;     // of the reference made here: 8192, 2048
+  uint32_t reference_paths = 0;     // of the reference made here, in two halves: 8192, 2048
   std::vector<ParetoCurve> curves;  // what to measure; empty: all
   uint64_t points = 0;              // surfels: the scene's default, 20,000
   uint32_t light_samples = 32;      // of the surfels, see RenderSettings
@@ -75,6 +75,8 @@ struct ParetoPoint {
   // rel_rmse is below twice the reference's noise: rr says more about the reference than about the
   // point.
   bool reference_limited = false;
+  // rel_rmse is below the noise itself: rr is 0 and says nothing.
+  bool noise_above_error = false;
   // No other point of its curve is as fast and as accurate and better in one of the two.
   bool on_front = false;
   // Thread-seconds that pt and irrcache would need for this rr, interpolated in logarithms between
@@ -120,14 +122,17 @@ struct ParetoReport {
 // indirect light, whose errors would have no scale. kInternal if two repeats differ in a bit or in
 // what was counted.
 //
-// The reference's own noise comes from the stderr layer, which errs on the high side: rr, which has
-// it taken out, errs on the low side, rel_rmse does not. The reference is made with another seed:
-// with the same one pt's points would be a part of it, and their errors would look too small.
+// The reference is the mean of two renders of half the paths and of different seeds; its noise is
+// what they differ by, see NoiseOfHalves. The seeds are none of a point: with the same one pt's
+// points would be a part of the reference, and their errors would look too small.
 absl::StatusOr<ParetoReport> RunPareto(const ParetoOptions& options,
                                        const std::function<void(std::string_view)>& progress);
 
 // "normal", "k=100 ε=0.1 24²", "64 paths", "a=0.2 1024 rays"
 std::string LabelOf(const ParetoPoint& point);
+
+// What a user should know of the errors, if anything: points whose error the noise exceeds.
+std::optional<std::string> NoiseWarning(const ParetoReport& report);
 
 // Sets on_front and the peers' seconds of every point from times and errors.
 void AnalysePoints(std::span<ParetoPoint> points);

@@ -3,10 +3,14 @@
 #include <algorithm>
 #include <array>
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "absl/strings/str_format.h"
+#include "bench/accuracy_frame.h"
+#include "bench/html_page.h"
 #include "bench/svg_plot.h"
 #include "bench/text.h"
 
@@ -90,6 +94,7 @@ Json ToJson(const ParetoPoint& p) {
       {"rel_rmse", p.rel_rmse},
       {"bias", p.bias},
       {"reference_limited", p.reference_limited},
+      {"noise_above_error", p.noise_above_error},
       {"on_front", p.on_front},
       {"pt_seconds_at_rr", OrNull(p.pt_seconds_at_rr)},
       {"irrcache_seconds_at_rr", OrNull(p.irrcache_seconds_at_rr)},
@@ -151,7 +156,11 @@ std::string SpeedupText(const ParetoPoint& p, const std::optional<double>& peer_
 std::string FlagsText(const ParetoPoint& p) {
   std::string flags;
   if (p.on_front) flags += "front";
-  if (p.reference_limited) Append(flags, {flags.empty() ? "" : ", ", "reference-limited"});
+  if (p.noise_above_error) {
+    Append(flags, {flags.empty() ? "" : ", ", "noise above error"});
+  } else if (p.reference_limited) {
+    Append(flags, {flags.empty() ? "" : ", ", "reference-limited"});
+  }
   return flags;
 }
 
@@ -172,27 +181,6 @@ LogLogPlot PlotOf(const ParetoReport& report) {
   if (report.reference_noise_known) plot.level = {report.reference_noise, "noise of the reference"};
   return plot;
 }
-
-std::string Row(std::string_view tag, const std::vector<std::string>& cells) {
-  std::string row = "<tr>";
-  for (const std::string& cell : cells) {
-    Append(row, {"<", tag, ">", EscapeXml(cell), "</", tag, ">"});
-  }
-  return row + "</tr>\n";
-}
-
-constexpr std::string_view kStyle = R"(
-:root { color-scheme: light dark; }
-body { font: 15px/1.45 sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }
-svg { width: 100%; height: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 1rem 0; }
-.wide { overflow-x: auto; }
-th, td { text-align: right; padding: .2rem .7rem; border-bottom: 1px solid #8884;
-         white-space: nowrap; }
-th:first-child, td:first-child, td:nth-child(2), th:nth-child(2), td:last-child, th:last-child
-{ text-align: left; }
-dt { font-weight: bold; } dd { margin: 0 0 .4rem 0; }
-)";
 
 }  // namespace
 
@@ -256,63 +244,68 @@ std::string ParetoJson(const ParetoReport& r) {
 }
 
 std::string ParetoHtml(const ParetoReport& r) {
-  int left_out = 0;
-  const std::string svg = RenderSvg(PlotOf(r), &left_out);
-  std::string html =
-      Concat({"<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>\n"
-              "<meta name='viewport' content='width=device-width'>\n<title>Time against error: ",
-              EscapeXml(r.options.scene), "</title>\n<style>", kStyle, "</style></head><body>\n",
-              "<h1>Time against error: ", EscapeXml(r.options.scene), "</h1>\n<dl>\n"});
-  const auto item = [&](std::string_view term, std::string_view text) {
-    Append(html, {"<dt>", term, "</dt><dd>", EscapeXml(text), "</dd>\n"});
-  };
-  item("Scene", SceneText(r));
-  item("Film", FilmText(r));
-  item("Reference", ReferenceText(r));
-  item("Machine", MachineText(r));
-  item("Run", absl::StrFormat("farpoint %s, %s, median of %d%s", FARPOINT_VERSION, r.date_utc,
-                              r.options.repeat, r.options.quick ? ", quick" : ""));
-  for (const std::string& note : r.notes) item("Note", note);
-  Append(html, {"</dl>\n", svg,
-                "<p>Lower left is better: less time, less error. Lines join the points of an "
-                "curve that none of its other points beats in both; points off the line are "
-                "faint. Rings: the reference's noise is more than half of the error."});
-  if (left_out > 0) {
-    Append(html, {" ", std::to_string(left_out),
-                  " points have an error or a time of zero and are in the table only."});
+  HtmlPage page(Concat({"Time against error: ", r.options.scene}));
+  std::vector<HtmlFact> facts = {
+      {"Scene", SceneText(r)},
+      {"Film", FilmText(r)},
+      {"Reference", ReferenceText(r)},
+      {"Machine", MachineText(r)},
+      {"Run", absl::StrFormat("farpoint %s, %s, median of %d%s", FARPOINT_VERSION, r.date_utc,
+                              r.options.repeat, r.options.quick ? ", quick" : "")}};
+  for (const std::string& note : r.notes) facts.push_back({"Note", note});
+  if (const std::optional<std::string> warning = NoiseWarning(r)) {
+    facts.push_back({"Warning", *warning});
   }
-  Append(html, {"</p>\n<h2>Points</h2>\n<div class='wide'><table>\n",
-                Row("th", {"curve", "setting", "gather, thread-s [min, max]", "µs/receiver", "rr",
-                           "rel. RMSE", "bias", "× pt at equal rr", "× irrcache at equal rr",
-                           "wall s [min, max]", "remarks"})});
+  page.Facts(facts);
+  page.Plot(PlotOf(r),
+            "Lower left is better: less time, less error. Lines join the points of a curve that "
+            "none of its other points beats in both; points off the line are faint. Rings: the "
+            "reference's noise is more than half of the error.");
+  page.Heading("Points");
+  HtmlTable points;
+  points.left_columns = 2;
+  points.head = {"curve",
+                 "setting",
+                 "gather, thread-s [min, max]",
+                 "µs/receiver",
+                 "rr",
+                 "rel. RMSE",
+                 "bias",
+                 "× pt at equal rr",
+                 "× irrcache at equal rr",
+                 "wall s [min, max]",
+                 "remarks"};
   for (const ParetoCurve curve : kCurves) {
     for (const ParetoPoint* p : ByTime(r, curve)) {
-      html += Row("td",
-                  {std::string(NameOf(curve)), LabelOf(*p), SpreadText(p->gather),
-                   absl::StrFormat("%.3g", p->us_per_receiver), absl::StrFormat("%.4f", p->rr),
-                   absl::StrFormat("%.4f", p->rel_rmse), absl::StrFormat("%+.4f", p->bias),
-                   SpeedupText(*p, p->pt_seconds_at_rr), SpeedupText(*p, p->irrcache_seconds_at_rr),
-                   SpreadText(p->wall), FlagsText(*p)});
+      points.rows.push_back(
+          {std::string(NameOf(curve)), LabelOf(*p), SpreadText(p->gather),
+           absl::StrFormat("%.3g", p->us_per_receiver), absl::StrFormat("%.4f", p->rr),
+           absl::StrFormat("%.4f", p->rel_rmse), absl::StrFormat("%+.4f", p->bias),
+           SpeedupText(*p, p->pt_seconds_at_rr), SpeedupText(*p, p->irrcache_seconds_at_rr),
+           SpreadText(p->wall), FlagsText(*p)});
     }
   }
-  Append(html, {"</table></div>\n<h2>Preparation</h2>\n<p>Thread-seconds once per scene, "
-                "not in the times above: median [min, max].</p>\n<div class='wide'><table>\n",
-                Row("th", {"for", "import", "sample", "shade", "tree", "total"})});
-  const auto preparation = [&](const char* name, const PreparationTimes& times) {
-    std::vector<std::string> cells = {name};
-    for (const Stage s : {Stage::kImport, Stage::kSample, Stage::kShade, Stage::kTree}) {
+  page.Table(points);
+  page.Heading("Preparation");
+  page.Paragraph("Thread-seconds once per scene, not in the times above: median [min, max].");
+  HtmlTable preparation;
+  preparation.head = {"for", "import", "sample", "shade", "tree", "total"};
+  const auto add = [&](const char* name, const PreparationTimes& times) {
+    std::vector<std::string>& cells = preparation.rows.emplace_back();
+    cells.emplace_back(name);
+    for (const Stage s : kBakeStages) {
       cells.push_back(SpreadText(times.stage[static_cast<size_t>(s)]));
     }
     cells.push_back(SpreadText(times.total));
-    html += Row("td", cells);
   };
-  preparation("fpbgi, pbgi, dpbgi", r.point_based);
-  preparation("pt, irrcache", r.path_traced);
-  return Concat({html,
-                 "</table></div>\n<p>Loading (ray acceleration structure, light tables; "
-                 "everyone needs it): ",
-                 SpreadText(r.load), " thread-seconds. The surfels about a hit, for adaptive ",
-                 "clusters: ", SpreadText(r.atlas), ".</p>\n", "</body></html>\n"});
+  add("fpbgi, pbgi, dpbgi", r.point_based);
+  add("pt, irrcache", r.path_traced);
+  page.Table(preparation);
+  page.Paragraph(Concat({"Loading (ray acceleration structure, light tables; everyone needs it): ",
+                         SpreadText(r.load),
+                         " thread-seconds. The surfels about a hit, for adaptive clusters: ",
+                         SpreadText(r.atlas), "."}));
+  return std::move(page).Finish();
 }
 
 std::string ParetoTable(const ParetoReport& r) {

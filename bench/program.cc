@@ -1,6 +1,7 @@
 #include "bench/program.h"
 
 #include <filesystem>
+#include <optional>
 #include <ostream>
 #include <span>
 #include <string_view>
@@ -38,6 +39,9 @@ absl::Status Pareto(const BenchCommandLine& line, std::ostream& out, std::ostrea
                         err << "farpoint-bench: " << text << std::endl;
                       }));
   for (const std::string& note : report.notes) err << "farpoint-bench: note: " << note << "\n";
+  if (const std::optional<std::string> warning = NoiseWarning(report)) {
+    err << "farpoint-bench: warning: " << *warning << "\n";
+  }
   FP_RETURN_IF_ERROR(WriteText(dir / "pareto.json", ParetoJson(report)));
   FP_RETURN_IF_ERROR(WriteText(dir / "pareto.html", ParetoHtml(report)));
   out << ParetoTable(report) << "\n"

@@ -55,17 +55,11 @@ class Rebake {
   absl::StatusOr<RebakeReport> Run() {
     report_.options = options_;
     const auto start = std::chrono::steady_clock::now();
-    FP_ASSIGN_OR_RETURN(BenchScene read, MakeBenchScene(options_.scene, options_.quick));
+    FP_ASSIGN_OR_RETURN(BenchScene read,
+                        MakeBenchScene(options_.scene, options_.quick, options_.changes));
     report_.import_s =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     base_ = std::move(read.scene);
-    if (options_.to_sun) {
-      base_.lights = {PunctualLight{.name = "sun",
-                                    .kind = PunctualKind::kDirectional,
-                                    .direction = Normalize(*options_.to_sun) * -1.0,
-                                    .intensity = options_.sun}};
-    }
-    if (options_.sky) base_.environment.sky = *options_.sky;
     if (base_.instances.empty()) return absl::InvalidArgumentError("the scene has no objects");
     const size_t object = std::min<size_t>(options_.object, base_.instances.size() - 1);
     const std::string object_name =

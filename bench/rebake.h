@@ -8,6 +8,7 @@
 #include <string_view>
 #include <vector>
 
+#include "bench/bench_scene.h"
 #include "core/base/stats.h"
 #include "core/base/status.h"
 #include "core/math/vec.h"
@@ -16,10 +17,8 @@ namespace farpoint {
 
 struct RebakeOptions {
   std::string scene = "cornell";  // as for MakeBenchScene
-  std::optional<Vec3d> to_sun;    // a sun in place of the scene's punctual lights
-  Rgb sun;                        // its irradiance, W/m²
-  std::optional<Rgb> sky;         // in place of the scene's
-  uint64_t points = 0;            // 0: the scene's default
+  SceneChanges changes;
+  uint64_t points = 0;  // 0: the scene's default
   uint32_t light_samples = 32;
   uint64_t seed = 0;
   uint32_t object = ~0u;  // index of the instance that moves; beyond the last: the last

@@ -56,21 +56,6 @@ Rgb HalfDifference(const Rgb& a, const Rgb& b) {
   return {std::fabs(d.x), std::fabs(d.y), std::fabs(d.z)};
 }
 
-double Noise(const std::vector<uint8_t>& hit, const std::array<std::vector<Rgb>, 2>& half) {
-  double sum = 0, square = 0, n = 0;
-  for (size_t i = 0; i < half[0].size(); ++i) {
-    if (!hit[i]) continue;
-    for (int c = 0; c < 3; ++c) {
-      const double a = static_cast<double>(half[0][i][c]);
-      const double b = static_cast<double>(half[1][i][c]);
-      sum += 0.5 * (a + b);
-      square += 0.25 * (a - b) * (a - b);
-      n += 1;
-    }
-  }
-  return sum > 0 ? std::sqrt(square * n) / sum : 0.0;
-}
-
 // Renders pixels by pt, each as a tile.
 class PixelTracer {
  public:
@@ -253,8 +238,27 @@ Rgb SparseReference::IndirectError(size_t i) const {
 Rgb SparseReference::DirectError(size_t i) const {
   return HalfDifference(direct_half[0][i], direct_half[1][i]);
 }
-double SparseReference::IndirectNoise() const { return Noise(hit, indirect_half); }
-double SparseReference::DirectNoise() const { return Noise(hit, direct_half); }
+double SparseReference::IndirectNoise() const {
+  return NoiseOfHalves(hit, indirect_half[0], indirect_half[1]);
+}
+double SparseReference::DirectNoise() const {
+  // Empty halves if it was not asked for.
+  return direct_half[0].empty() ? 0.0 : NoiseOfHalves(hit, direct_half[0], direct_half[1]);
+}
+
+double NoiseOfHalves(std::span<const uint8_t> on, std::span<const Rgb> a, std::span<const Rgb> b) {
+  double sum = 0, square = 0, n = 0;
+  for (size_t i = 0; i < on.size(); ++i) {
+    if (on[i] == 0) continue;
+    for (int c = 0; c < 3; ++c) {
+      const double va = static_cast<double>(a[i][c]), vb = static_cast<double>(b[i][c]);
+      sum += 0.5 * (va + vb);
+      square += 0.25 * (va - vb) * (va - vb);
+      n += 1;
+    }
+  }
+  return sum > 0 ? std::sqrt(square * n) / sum : 0.0;
+}
 
 std::vector<std::byte> EncodeSparseReference(const SparseReference& r, const Digest& key) {
   ByteWriter out;

@@ -87,6 +87,10 @@ absl::StatusOr<SparseReference> TraceSparseReference(
     const SparseReferenceOptions& options, Executor& executor,
     const std::function<void(std::string_view)>& progress);
 
+// Of the mean of two independent estimates: sqrt(mean(((a - b) / 2)^2)) over mean((a + b) / 2),
+// where `on` is not 0, of the channels together. 0 if the mean is not positive. All equally long.
+double NoiseOfHalves(std::span<const uint8_t> on, std::span<const Rgb> a, std::span<const Rgb> b);
+
 // The bytes of a file of the cache and back. kDataLoss for anything that EncodeSparseReference did
 // not write for this key and number of pixels. Sizes are checked before anything is allocated.
 std::vector<std::byte> EncodeSparseReference(const SparseReference& reference, const Digest& key);

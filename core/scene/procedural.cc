@@ -1,16 +1,13 @@
 #include "core/scene/procedural.h"
 
-#include <array>
-#include <utility>
 #include <vector>
 
 #include "core/math/elementary.h"
+#include "core/scene/quad_mesh.h"
 
 namespace farpoint {
 
 namespace {
-
-using Quad = std::array<Vec3f, 4>;
 
 struct CornellObject {
   const char* name;
@@ -71,40 +68,17 @@ std::vector<CornellObject> CornellObjects() {
   };
 }
 
-Mesh MeshOfQuads(const char* name, int32_t material, const std::vector<Quad>& quads) {
-  Mesh mesh;
-  mesh.name = name;
-  mesh.material = material;
-  for (const Quad& quad : quads) {
-    const auto first = static_cast<uint32_t>(mesh.positions.size());
-    mesh.positions.insert(mesh.positions.end(), quad.begin(), quad.end());
-    mesh.triangles.push_back({first, first + 1, first + 2});
-    mesh.triangles.push_back({first, first + 2, first + 3});
-  }
-  return mesh;
-}
-
-Material Lambert(const char* name, const Rgb& albedo, const Rgb& emission = {}) {
-  Material material;
-  material.name = name;
-  material.base_color = albedo;
-  material.emission = emission;
-  material.metallic = 0;
-  return material;
-}
-
 }  // namespace
 
 Scene MakeCornellBox() {
   Scene scene;
   scene.name = "cornell";
-  scene.materials = {
-      Lambert("white", {0.725f, 0.71f, 0.68f}), Lambert("red", {0.63f, 0.065f, 0.05f}),
-      Lambert("green", {0.14f, 0.45f, 0.091f}), Lambert("light", {0, 0, 0}, {17, 12, 4})};
+  scene.materials = {LambertMaterial("white", {0.725f, 0.71f, 0.68f}),
+                     LambertMaterial("red", {0.63f, 0.065f, 0.05f}),
+                     LambertMaterial("green", {0.14f, 0.45f, 0.091f}),
+                     LambertMaterial("light", {0, 0, 0}, {17, 12, 4})};
   for (const CornellObject& object : CornellObjects()) {
-    const auto mesh = static_cast<uint32_t>(scene.meshes.size());
-    scene.meshes.push_back(MeshOfQuads(object.name, object.material, object.quads));
-    scene.instances.push_back({object.name, mesh, {}});
+    AddQuads(object.name, object.material, object.quads, scene);
   }
   Camera camera;
   camera.name = "camera";
@@ -121,7 +95,7 @@ Scene MakeCornellBox() {
 Scene MakeFurnace(float rho, float radiance) {
   Scene scene;
   scene.name = "furnace";
-  scene.materials = {Lambert("furnace", Rgb(rho), Rgb(radiance))};
+  scene.materials = {LambertMaterial("furnace", Rgb(rho), Rgb(radiance))};
   // Wound so that the fronts face inwards.
   const std::vector<Quad> walls = {{{{-1, -1, -1}, {-1, -1, 1}, {1, -1, 1}, {1, -1, -1}}},
                                    {{{-1, 1, -1}, {1, 1, -1}, {1, 1, 1}, {-1, 1, 1}}},
@@ -129,8 +103,7 @@ Scene MakeFurnace(float rho, float radiance) {
                                    {{{-1, -1, 1}, {-1, 1, 1}, {1, 1, 1}, {1, -1, 1}}},
                                    {{{-1, -1, -1}, {-1, 1, -1}, {-1, 1, 1}, {-1, -1, 1}}},
                                    {{{1, -1, -1}, {1, -1, 1}, {1, 1, 1}, {1, 1, -1}}}};
-  scene.meshes.push_back(MeshOfQuads("walls", 0, walls));
-  scene.instances.push_back({"walls", 0, {}});
+  AddQuads("walls", 0, walls, scene);
   Camera camera;
   camera.name = "centre";
   camera.yfov_rad = 1.2;

@@ -6,6 +6,7 @@
 namespace farpoint {
 namespace {
 
+using ::testing::AllOf;
 using ::testing::HasSubstr;
 using ::testing::Not;
 
@@ -131,9 +132,10 @@ TEST(BenchCommandLine, RebakeTakesAll) {
   EXPECT_EQ(line->verb, BenchVerb::kRebake);
   const RebakeOptions& r = line->rebake;
   EXPECT_EQ(r.scene, "city");
-  EXPECT_EQ(r.to_sun, Vec3d(0.5, 1, -2));
-  EXPECT_EQ(r.sun, Rgb(3, 4, 5.5f));
-  EXPECT_EQ(r.sky, Rgb(1, 2, 3));
+  ASSERT_TRUE(r.changes.sun && r.changes.sky);
+  EXPECT_EQ(r.changes.sun->to_sun, Vec3d(0.5, 1, -2));
+  EXPECT_EQ(r.changes.sun->irradiance, Rgb(3, 4, 5.5f));
+  EXPECT_EQ(*r.changes.sky, Rgb(1, 2, 3));
   EXPECT_EQ(r.points, 77u);
   EXPECT_EQ(r.light_samples, 9u);
   EXPECT_EQ(r.seed, 3u);
@@ -158,6 +160,18 @@ TEST(BenchCommandLine, LightsTakesAll) {
   EXPECT_EQ(line->lights.seed, 3u);
   EXPECT_TRUE(line->lights.quick);
   EXPECT_THAT(MessageOf({"lights", "--receivers", "0"}), HasSubstr("--receivers"));
+}
+
+TEST(BenchCommandLine, UnknownScenesAreUsageErrorsThatListTheKnownOnes) {
+  EXPECT_THAT(MessageOf({"accuracy", "--case", "cornell", "--case", "nope"}),
+              AllOf(HasSubstr("--case nope"), HasSubstr("macross"), HasSubstr("leak-wall")));
+  // The large ones are none of a quick run.
+  EXPECT_THAT(MessageOf({"accuracy", "--quick", "--case", "macross"}),
+              AllOf(HasSubstr("--case macross"), HasSubstr("--quick")));
+  EXPECT_THAT(MessageOf({"paper", "--scene", "foo"}),
+              AllOf(HasSubstr("--scene foo"), HasSubstr("cornell, bunny, city, sponza")));
+  EXPECT_TRUE(ParseBenchCommandLine({"accuracy", "--case", "leak-room"}).ok());
+  EXPECT_TRUE(ParseBenchCommandLine({"paper", "--scene", "city"}).ok());
 }
 
 TEST(BenchCommandLine, PlannedBenchmarksAreRefusedPlainly) {

@@ -38,10 +38,26 @@ TEST(ParetoJson, HasEveryKey) {
   for (const Json& curve : json["curves"]) {
     ExpectKeys(curve, {"curve", "points"});
     for (const Json& p : curve["points"]) {
-      ExpectKeys(p, {"label", "quality", "clusters", "epsilon", "microbuffer", "paths",
-                     "cache_error", "seconds", "wall_seconds", "us_per_receiver", "rr", "rel_rmse",
-                     "bias", "reference_limited", "on_front", "pt_seconds_at_rr",
-                     "irrcache_seconds_at_rr", "counts", "hash"});
+      ExpectKeys(p, {"label",
+                     "quality",
+                     "clusters",
+                     "epsilon",
+                     "microbuffer",
+                     "paths",
+                     "cache_error",
+                     "seconds",
+                     "wall_seconds",
+                     "us_per_receiver",
+                     "rr",
+                     "rel_rmse",
+                     "bias",
+                     "reference_limited",
+                     "noise_above_error",
+                     "on_front",
+                     "pt_seconds_at_rr",
+                     "irrcache_seconds_at_rr",
+                     "counts",
+                     "hash"});
       ExpectKeys(p["seconds"], {"gather", "primary", "direct", "cluster", "cut", "raster",
                                 "composite", "convolve", "trace"});
       ExpectKeys(p["seconds"]["gather"], {"median", "min", "max"});
@@ -130,7 +146,7 @@ TEST(ParetoHtml, EveryPointIsInPlotAndTable) {
   ASSERT_TRUE(TinyReport().ok()) << TinyReport().status();
   const std::string html = ParetoHtml(*TinyReport());
   for (const ParetoPoint& p : TinyReport()->points) {
-    EXPECT_THAT(html, HasSubstr("<td>" + LabelOf(p) + "</td>"));
+    EXPECT_THAT(html, HasSubstr("'>" + LabelOf(p) + "</td>"));
     if (p.rr > 0) {
       EXPECT_THAT(html,
                   HasSubstr("<title>" + std::string(NameOf(p.curve())) + " " + LabelOf(p) + ": "));
@@ -155,7 +171,7 @@ TEST(ParetoHtml, PointsWithoutPlaceAreSaid) {
   report.points[0].rr = 0.1;
   report.points[1] = report.points[0];
   report.points[1].rr = 0;
-  EXPECT_THAT(ParetoHtml(report), HasSubstr(" 1 points have an error or a time of zero"));
+  EXPECT_THAT(ParetoHtml(report), HasSubstr(" 1 points are zero in one of the two"));
 }
 
 TEST(ParetoTable, SaysTimeAndErrorOfEveryPoint) {
@@ -167,6 +183,27 @@ TEST(ParetoTable, SaysTimeAndErrorOfEveryPoint) {
   }
   const auto lines = std::count(table.begin(), table.end(), '\n');
   EXPECT_GE(lines, static_cast<std::ptrdiff_t>(TinyReport()->points.size()) + 6);
+}
+
+TEST(ParetoTable, NoiseAboveAnErrorIsSaid) {
+  ParetoReport report;
+  report.points.resize(2);
+  report.points[0].integrator = report.points[1].integrator = Integrator::kPt;
+  report.points[0].paths = 64;
+  report.points[1].paths = 256;
+  report.reference_noise = 0.03;
+  EXPECT_FALSE(NoiseWarning(report).has_value());
+  EXPECT_THAT(ParetoHtml(report), Not(HasSubstr("Warning")));
+  report.points[1].noise_above_error = report.points[1].reference_limited = true;
+  ASSERT_TRUE(NoiseWarning(report).has_value());
+  EXPECT_THAT(*NoiseWarning(report), HasSubstr("0.03"));
+  EXPECT_THAT(*NoiseWarning(report), HasSubstr("pt 256 paths"));
+  EXPECT_THAT(*NoiseWarning(report), Not(HasSubstr("64 paths")));
+  EXPECT_THAT(ParetoTable(report), HasSubstr("noise above error"));
+  EXPECT_THAT(ParetoHtml(report), HasSubstr("Warning"));
+  const Json json = Json::parse(ParetoJson(report));
+  EXPECT_EQ(json["curves"][4]["points"][0]["noise_above_error"], false);
+  EXPECT_EQ(json["curves"][4]["points"][1]["noise_above_error"], true);
 }
 
 TEST(ParetoTable, UnknownNoiseIsSaid) {

@@ -272,8 +272,10 @@ TEST_F(ParetoReference, NoiseIsTakenOutAndMarksWhatItLimits) {
     EXPECT_EQ(p.rr, 0.0);
     EXPECT_GT(p.rel_rmse, 0.0);
     EXPECT_TRUE(p.reference_limited);
+    EXPECT_TRUE(p.noise_above_error);
     EXPECT_FALSE(p.pt_seconds_at_rr.has_value());
   }
+  EXPECT_TRUE(NoiseWarning(*r).has_value());
 }
 
 TEST_F(ParetoReference, MaskChoosesPixels) {
@@ -309,6 +311,15 @@ TEST_F(ParetoReference, MaskThatIsTooSmallIsRefused) {
   const auto r = RunTiny();
   EXPECT_EQ(r.status().code(), absl::StatusCode::kInvalidArgument);
   EXPECT_THAT(std::string(r.status().message()), HasSubstr("mask.exr"));
+}
+
+TEST_F(ParetoReference, MaskThatIsTooLargeIsRefused) {
+  const Film film({0, 0, 48, 48}, {Layer::kDepth});
+  options_.mask_path = folder_ / "mask.exr";
+  ASSERT_TRUE(WriteExr(options_.mask_path, film, 48, 48, {}, ExrCompression::kZip).ok());
+  const auto r = RunTiny();
+  EXPECT_EQ(r.status().code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_THAT(std::string(r.status().message()), HasSubstr("48x48"));
 }
 
 TEST_F(ParetoReference, MissingFileIsNamed) {

@@ -12,8 +12,7 @@ TEST(Rebake, ReportsWhatEachChangeKept) {
   RebakeOptions options;
   options.quick = true;
   options.threads = 2;
-  options.to_sun = Vec3d(0.1, 0.2, 1);
-  options.sun = Rgb(1, 1, 1);
+  options.changes.sun = AccuracySun{{0.1, 0.2, 1}, Rgb(1, 1, 1)};
   const auto report = RunRebake(options, [](std::string_view) {});
   ASSERT_TRUE(report.ok()) << report.status();
   const auto json = nlohmann::json::parse(RebakeJson(*report));

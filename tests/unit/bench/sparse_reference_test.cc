@@ -219,5 +219,15 @@ TEST(SparseReference, RefusesSizesAndValuesThatMakeNoSense) {
   EXPECT_FALSE(DecodeSparseReference(EncodeSparseReference(nan, key), key, 2).ok());
 }
 
+TEST(SparseReference, NoiseIsHalfOfWhatHalvesDifferByOverTheirMean) {
+  const std::vector<uint8_t> on = {1, 0, 1};
+  // Differences of 0.4 and 0.8 about means of 1 and 3; the pixel between does not count.
+  const std::vector<Rgb> a = {Rgb(1.2f), Rgb(9), Rgb(2.6f)}, b = {Rgb(0.8f), Rgb(1), Rgb(3.4f)};
+  EXPECT_NEAR(NoiseOfHalves(on, a, b), std::sqrt((0.2 * 0.2 + 0.4 * 0.4) / 2) / 2, 1e-6);
+  EXPECT_EQ(NoiseOfHalves(on, a, a), 0);
+  EXPECT_EQ(NoiseOfHalves(std::vector<uint8_t>(3, 0), a, b), 0);
+  EXPECT_EQ(NoiseOfHalves({}, {}, {}), 0);
+}
+
 }  // namespace
 }  // namespace farpoint
