@@ -59,7 +59,7 @@ uint32_t OwenShuffledIndex(uint32_t index, uint32_t seed);
 Vec2f ConcentricDisc(float u, float v);
 // u, v in [0, 1) -> hemisphere about +z. pdf_sr = cos(theta) / pi.
 Vec3f CosineHemisphere(float u, float v);
-// The same in eight lanes and in single precision; components differ by less than 4e-7.
+// The same in eight lanes and in single precision: x, y and z² differ by less than 8e-7.
 V8 CosineHemisphere8(F8 u, F8 v);
 // u, v in [0, 1) -> the whole sphere. pdf_sr = 1 / (4 pi).
 Vec3f UniformSphere(float u, float v);

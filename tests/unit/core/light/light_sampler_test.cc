@@ -330,6 +330,108 @@ TEST(RectangularEmitter, NearItIsSeenAsAHalfSpace) {
   }
 }
 
+TEST(Emitters, TrianglesOfAllShapesMatchTheClosedForm) {
+  // Slivers, triangles that fill half of what is seen and such as fill next to nothing, high over
+  // the point and just over its horizon.
+  TestRandom random(31);
+  for (int i = 0; i < 300; ++i) {
+    SCOPED_TRACE(i);
+    const double size = std::exp2(random.Uniform(-5, 5)), thin = std::exp2(random.Uniform(-8, 0));
+    const Vec3d center(random.Uniform(-1, 1), std::exp2(random.Uniform(-3, 1)),
+                       random.Uniform(-1, 1));
+    const auto direction = [&] {
+      return Normalize(Vec3d(random.Uniform(-1, 1), random.Uniform(-1, 1), random.Uniform(-1, 1)) +
+                       Vec3d(1e-3, 0, 0));
+    };
+    const Vec3d along = direction(), across = NormalizeOr(Cross(along, direction()), along);
+    std::array<Vec3d, 3> corner = {
+        center - along * (0.5 * size), center + along * (0.5 * size),
+        center + along * (size * random.Uniform(-0.5, 0.5)) + across * (size * thin)};
+    // All above the horizon, for the closed form; not edge-on, where both lose their digits.
+    double lowest = 1e30;
+    for (const Vec3d& v : corner) lowest = std::min(lowest, v.y);
+    const double lift = std::max(0.0, 0.02 - lowest);
+    for (Vec3d& v : corner) v.y += lift;
+    const Vec3d normal = Normalize(Cross(corner[1] - corner[0], corner[2] - corner[0]));
+    if (std::fabs(Dot(normal, Normalize(corner[0]))) < 0.02) continue;
+    for (Vec3d& v : corner) v = Vec3d(Vec3f(v));
+    Scene scene;
+    Mesh mesh;
+    for (const Vec3d& v : corner) mesh.positions.push_back(Vec3f(v));
+    mesh.triangles = {{0, 1, 2}};
+    mesh.material = 0;
+    scene.materials.push_back(Emitting(1));
+    scene.instances.push_back({"triangle", 0, {}});
+    scene.meshes.push_back(mesh);
+    AddQuad(scene, FloorQuad(0.01, -1e-3), Material());
+    const Lit lit(scene);
+    const Estimate e = OverKeys(lit, {0, 0, 0}, kUp, 32, 256);
+    const double expected = PolygonIrradiance(corner, {0, lit.surface_offset_m(), 0}, {0, 1, 0});
+    EXPECT_NEAR(e.mean(), expected, 5 * e.standard_error() + 5e-5 * expected);
+    EXPECT_LT(e.standard_error(), 0.01 * expected);
+  }
+}
+
+TEST(IrradianceEach, IsIrradianceOfEachPointAlone) {
+  TestRandom random(7);
+  Scene two, many, all;
+  AddQuad(two, FloorQuad(0.5, 2), Emitting(3));
+  for (int i = 0; i < 12; ++i) {
+    const double x = i % 4 - 1.5, z = i / 4 - 1.0;
+    const Quad q = {Vec3d(x, 2, z), Vec3d(x + 0.4, 2, z), Vec3d(x + 0.4, 2.1, z + 0.4),
+                    Vec3d(x, 2.1, z + 0.4)};
+    AddQuad(many, q, Emitting(static_cast<float>(i + 1)));
+  }
+  all = many;
+  PunctualLight light;
+  light.position = {0, 3, 0.3};
+  light.intensity = {7, 0.5f, 100};
+  all.lights.push_back(light);
+  light.kind = PunctualKind::kDirectional;
+  light.direction = Vec3d(0.3, -0.8, 0.1);
+  all.lights.push_back(light);
+  all.environment.sky = {1, 2, 0.5f};
+  for (Scene* scene : {&two, &many, &all}) {
+    AddQuad(*scene, FloorQuad(2), Material());
+    AddQuad(*scene, FloorQuad(0.7, 1), Material());  // a table, for shadows
+    const Lit lit(*scene);
+    std::vector<SurfacePoints8> points(11);
+    for (size_t i = 0; i < points.size(); ++i) {
+      for (size_t k = 0; k < 8; ++k) {
+        points[i].p.SetLane(k,
+                            lit.Local({random.Uniform(-1.5, 1.5), 0, random.Uniform(-1.5, 1.5)}));
+        points[i].ng.SetLane(k, kUp);
+        points[i].n.SetLane(k, Normalize(Vec3f(static_cast<float>(random.Uniform(-0.3, 0.3)), 1,
+                                               static_cast<float>(random.Uniform(-0.3, 0.3)))));
+        points[i].index[k] = static_cast<uint32_t>(8 * i + k + (i > 5 ? 1000 : 0));
+      }
+      points[i].active = i == 3 ? 0u : i == 4 ? 0x51u : 0xffu;
+    }
+    std::vector<V8> together(points.size());
+    LightCounters counters, counters_alone;
+    lit.sampler().IrradianceEach(points, 99, 2, together, counters);
+    bool lit_anywhere = false, dark_anywhere = false;
+    for (size_t i = 0; i < points.size(); ++i) {
+      for (size_t k = 0; k < 8; ++k) {
+        Rgb alone;
+        if ((points[i].active >> k & 1u) != 0) {
+          alone = lit.sampler().Irradiance(points[i].p.Lane(k), points[i].ng.Lane(k),
+                                           points[i].n.Lane(k), 1, 99, points[i].index[k], 2,
+                                           counters_alone);
+          (alone.x > 0 ? lit_anywhere : dark_anywhere) = true;
+        }
+        EXPECT_EQ(together[i].Lane(k), alone) << i << " " << k;
+      }
+    }
+    EXPECT_TRUE(lit_anywhere);
+    EXPECT_TRUE(dark_anywhere || scene == &all);
+    EXPECT_EQ(counters.rays, counters_alone.rays);
+    EXPECT_EQ(counters.blocked, counters_alone.blocked);
+    EXPECT_EQ(counters.samples, counters_alone.samples);
+    EXPECT_EQ(counters.skipped_facing_away, counters_alone.skipped_facing_away);
+  }
+}
+
 TEST(Emitters, ManyOfDifferentPowerAddUp) {
   Scene scene;
   TestRandom random(5);

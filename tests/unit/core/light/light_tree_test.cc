@@ -6,6 +6,7 @@
 #include <cmath>
 #include <map>
 #include <set>
+#include <span>
 #include <vector>
 
 #include "tests/unit/core/accel/brute_force.h"
@@ -195,6 +196,40 @@ TEST(LightTree, TheCacheChangesNothing) {
     EXPECT_EQ(a->probability, b->probability);
     EXPECT_EQ(u, v);
   }
+}
+
+TEST(LightTree, EightPointsChooseInABlockLikeEachAlone) {
+  TestRandom random(12);
+  for (size_t count = 1; count <= LightTree::kWidth; ++count) {
+    EXPECT_TRUE(LightTree(Cloud(count, 1), LightTree::Emission::kCone).is_one_block());
+    for (int i = 0; i < 500; ++i) {
+      std::array<F8, LightTree::kWidth> weights{};
+      U8 bits;
+      for (size_t k = 0; k < 8; ++k) {
+        for (size_t light = 0; light < count; ++light) {
+          const double w = random.Uniform() < 0.4 ? 0.0 : std::exp2(random.Uniform(-20, 20));
+          weights[light][k] = static_cast<float>(w);
+        }
+        bits[k] = k == 0 ? 0u : k == 1 ? ~0u : static_cast<uint32_t>(random.Uniform() * 0x1p32);
+      }
+      const LightTree::Choices8 choices =
+          LightTree::ChooseInBlock8(std::span(weights).first(count), bits);
+      for (size_t k = 0; k < 8; ++k) {
+        LightTree::Weights own;
+        for (size_t light = 0; light < LightTree::kWidth; ++light) own[light] = weights[light][k];
+        double u = bits[k] * 0x1p-32;
+        const auto choice = LightTree::ChooseInBlock(own, u);
+        ASSERT_EQ((Bits8(choices.any) >> k & 1u) != 0, choice.has_value());
+        ASSERT_LT(choices.place[k], LightTree::kWidth);
+        if (!choice) continue;
+        ASSERT_EQ(choices.place[k], choice->place);
+        ASSERT_EQ(choices.probability[k], static_cast<float>(choice->probability));
+        ASSERT_EQ(choices.u[k], static_cast<float>(u));
+      }
+    }
+  }
+  EXPECT_FALSE(LightTree(Cloud(9, 1), LightTree::Emission::kCone).is_one_block());
+  EXPECT_FALSE(LightTree().is_one_block());
 }
 
 TEST(LightTree, ManyLightsInOnePlaceAndAtThePointAreFinite) {

@@ -100,6 +100,24 @@ TEST(OwenSobol, SeedsGiveDifferentPointSets) {
   EXPECT_LT(same, 2);
 }
 
+TEST(OwenSobolAxis, GivesTheSameBitsInLanes) {
+  for (unsigned dimension = 0; dimension < 4; ++dimension) {
+    for (const uint32_t seed : {0u, 1u, 0x9e3779b9u}) {
+      const OwenSobolAxis axis(dimension, seed);
+      for (uint32_t i = 0; i < 2000; ++i) {
+        const uint32_t far = i * 0x01234567u;
+        const U8 index = {i, i + 1, i + 7, far, far + 1, 255, 256, ~i};
+        const U8 bits = axis.BitsOf(index);
+        const F8 points = axis.PointsOf(index);
+        for (int k = 0; k < 8; ++k) {
+          ASSERT_EQ(bits[k], OwenSobolBits(index[k], dimension, seed));
+          ASSERT_EQ(points[k], OwenSobol(index[k], dimension, seed));
+        }
+      }
+    }
+  }
+}
+
 TEST(OwenShuffledIndex, KeepsAlignedBlocksTogetherAndLosesNone) {
   for (const uint32_t seed : kSeeds) {
     for (const uint32_t log2_size : {2u, 8u}) {
@@ -190,6 +208,30 @@ TEST(CosineHemisphere, IsUnitAndAboveTheHorizon) {
   const float last = ToUnitFloat(0xffffffffu);
   for (const float u : {0.0f, last}) {
     for (const float v : {0.0f, last}) EXPECT_TRUE(IsFinite(CosineHemisphere(u, v)));
+  }
+}
+
+TEST(CosineHemisphere8, IsThatOfOneLane) {
+  for (uint32_t i = 0; i < 20000; ++i) {
+    F8 u, v;
+    for (uint32_t k = 0; k < 8; ++k) {
+      u[k] = OwenSobol(8 * i + k, 0, 5);
+      v[k] = OwenSobol(8 * i + k, 1, 5);
+    }
+    // The centre, the edges and the diagonals of the square.
+    if (i == 0) {
+      u = F8{0.5f, 0, 0, 0.99999994f, 0.5f, 0.25f, 0.75f, 0};
+      v = F8{0.5f, 0, 0.5f, 0.99999994f, 0, 0.75f, 0.25f, 0.99999994f};
+    }
+    const V8 w = CosineHemisphere8(u, v);
+    for (size_t k = 0; k < 8; ++k) {
+      const Vec3f one = CosineHemisphere(u[k], v[k]);
+      ASSERT_LT(std::fabs(w.x[k] - one.x), 4e-7f) << u[k] << " " << v[k];
+      ASSERT_LT(std::fabs(w.y[k] - one.y), 4e-7f) << u[k] << " " << v[k];
+      // At the horizon a rounding error in x or y is its square root in z.
+      ASSERT_LT(std::fabs(w.z[k] * w.z[k] - one.z * one.z), 8e-7f) << u[k] << " " << v[k];
+      ASSERT_GE(w.z[k], 0.0f);
+    }
   }
 }
 

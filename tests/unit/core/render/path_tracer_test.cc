@@ -106,6 +106,62 @@ std::vector<Receiver> CornellReceivers(const World& world) {
           world.At({5.55, 4.0, 3.0}, Normalize(Vec3f(-1, 0, 0)))};
 }
 
+// One path after the other, as the header says.
+Rgb OneByOne(const World& world, const Receiver& r, uint32_t paths, uint64_t key) {
+  const PreparedScene& scene = world.scene();
+  const uint32_t seed = static_cast<uint32_t>(HashKey(key, 11));
+  const Frame frame(r.normal);
+  LightCounters counters;
+  Vec3d sum;
+  for (uint32_t i = 0; i < paths; ++i) {
+    const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
+    if (!(Dot(w, r.geometric_normal) > 0.0f)) continue;
+    const auto hit =
+        world.accel->Intersect(world.accel->LeaveSurface(r.position, r.geometric_normal), w);
+    if (!hit) continue;
+    Vec3f ng = scene.GeometricNormal(hit->triangle);
+    Vec3f n = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2, ng);
+    if (Dot(ng, w) > 0.0f) {
+      ng = -ng;
+      n = -n;
+    }
+    const Rgb e = world.lights->Irradiance(scene.PointOn(hit->triangle, hit->b1, hit->b2), ng, n, 1,
+                                           HashKey(key, 12), i, 2, counters);
+    sum += Vec3d(scene.Surface(hit->triangle, hit->b1, hit->b2).albedo * e);
+  }
+  return Rgb(sum / static_cast<double>(paths));
+}
+
+TEST(TraceIndirect, PathsSideBySideAreThoseOneByOne) {
+  // Directions differ in their last bits, so now and then a path takes another turn at an edge.
+  Scene smooth = MakeCornellBox();
+  for (Mesh& mesh : smooth.meshes) {
+    TestRandom random(mesh.positions.size());
+    mesh.normals.clear();
+    for (size_t v = 0; v < mesh.positions.size(); ++v) {
+      mesh.normals.push_back(Normalize(Vec3f(static_cast<float>(random.Uniform(-1, 1)),
+                                             static_cast<float>(random.Uniform(-1, 1)), 1.5f)));
+    }
+  }
+  for (const Scene& scene : {MakeCornellBox(), smooth}) {
+    const World world(scene);
+    int off = 0, count = 0;
+    for (const Receiver& r : CornellReceivers(world)) {
+      for (const uint32_t paths : {1u, 5u, 8u, 63u, 64u, 65u, 200u, 256u}) {
+        for (uint64_t key = 0; key < 8; ++key) {
+          const Rgb together = world.Trace(r, paths, key).irradiance;
+          const Rgb alone = OneByOne(world, r, paths, key);
+          for (int c = 0; c < 3; ++c) {
+            ++count;
+            off += std::fabs(together[c] - alone[c]) > 1e-4f * alone[c] + 1e-6f;
+          }
+        }
+      }
+    }
+    EXPECT_LE(off, count / 50);
+  }
+}
+
 TEST(TraceIndirect, MeanOverKeysEqualsPlainRandomPaths) {
   const World world(MakeCornellBox());
   for (const Receiver& r : CornellReceivers(world)) {
