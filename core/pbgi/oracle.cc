@@ -73,10 +73,16 @@ void Visit(const PointTree& tree, const CutView& view, const CutParams& params, 
   if (BelowEveryHorizon(n, view) || OnlyInvisibleSides(n, view)) return;
   const Vec3d v = n.centre - Vec3d(view.position);
   const double d = Length(v);
+  double pixel_sr = params.pixel_sr;
+  if (params.map == BufferMap::kCosine) {
+    pixel_sr /= std::max(0.1, Dot(Vec3d(view.normal), v) / d);
+  }
+  const bool fine =
+      kPi * n.radius * n.radius <= kCutPixels * pixel_sr * d * d && Length2(n.mean) >= 0.5;
   if (near != nullptr) {
     const bool is_far = view.radius_m < params.epsilon * (d - n.radius);
     const bool is_near = view.radius_m >= params.epsilon * (d + n.radius);
-    if (is_near || (level == 0 && !is_far)) {
+    if (is_near || (!is_far && (level == 0 || fine))) {
       near->push_back({slot, level});
       return;
     }
@@ -93,12 +99,6 @@ void Visit(const PointTree& tree, const CutView& view, const CutParams& params, 
     if (!own && d > 0) far.push_back(MakeNode(n, view, slot, v, d));
     return;
   }
-  double pixel_sr = params.pixel_sr;
-  if (params.map == BufferMap::kCosine) {
-    pixel_sr /= std::max(0.1, Dot(Vec3d(view.normal), v) / d);
-  }
-  const bool fine =
-      kPi * n.radius * n.radius <= kCutPixels * pixel_sr * d * d && Length2(n.mean) >= 0.5;
   if (fine) {
     far.push_back(MakeNode(n, view, slot, v, d));
     return;

@@ -154,13 +154,15 @@ Verdict Judge(const NodeGroup& g, const LaneView& v, bool leaf, CutCounters& cou
     near = alive & (v.radius >= v.epsilon * (d + r));
   }
   if (leaf) {
-    // A surfel that straddles the border between near and far is near.
+    // A surfel that straddles the border between near and far is near, too.
     near = v.sharing ? (alive & ~far) : near;
     const M8 own_surface =
         (Abs8(facing) < Set8(kSelfPlaneFactor) * r) & (Abs8(n_dot_m) > Set8(kSelfNormalCosine));
     out.splat = Bits8(far & ~own_surface);
     out.near = Bits8(near);
   } else {
+    // Descending a node that is fine enough would cut it finer than a receiver alone does.
+    if (v.sharing) near |= alive & ~far & ~coarse;
     out.splat = Bits8(far & ~coarse);
     out.near = Bits8(near);
     out.descend = Bits8(alive & ~near & ~(far & ~coarse));

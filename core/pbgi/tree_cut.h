@@ -33,8 +33,8 @@ inline constexpr float kCutPixels = 4.0f;
 // When to descend.
 struct CutParams {
   // far: R_c < epsilon (d - r); near: R_c >= epsilon (d + r) (§3.2 with its erratum,
-  // docs/paper-map.md: the measure γ = R_c / d is small for far nodes), everything between
-  // descends.
+  // docs/paper-map.md: the measure γ = R_c / d is small for far nodes). What lies between is near
+  // if it is fine enough or a surfel, else it descends.
   float epsilon = 0.1f;
   // A node is fine enough if its sphere's solid angle pi r²/d² is at most that of kCutPixels
   // pixels in its direction: a node is flat and seen at an angle, so what it covers is less.

@@ -47,6 +47,29 @@ TEST(Cornell, PaperPresetAgreesRoughly) {
   EXPECT_LE(Compare(r.film, truth.film, Layer::kIrradiance).rr, 0.40);
 }
 
+// Opaque splats make light jump from pixel to pixel of a buffer, for a cluster elsewhere than for
+// its receivers: buffers of 24² have twice the error (docs/decisions/0019-the-papers-preset.md).
+TEST(Cornell, PaperPresetIsNearItsOwnPbgi) {
+  const Scene scene = MakeCornellBox();
+  FilmSpec film = Whole(1024, 1024);
+  film.crop = {448, 384, 480, 416};  // the back wall above the tall box
+  RenderSettings paper = Settings(Integrator::kFpbgi);
+  ApplyPaperPreset(paper);
+  paper.points = 40000;
+  const auto error_of_sharing = [&] {
+    RenderSettings alone = paper;
+    alone.integrator = Integrator::kPbgi;
+    const Rendered fpbgi = RenderScene(scene, scene.cameras[0], film, paper);
+    const Rendered pbgi = RenderScene(scene, scene.cameras[0], film, alone);
+    return Compare(fpbgi.film, pbgi.film, Layer::kIrradiance);
+  };
+  const ErrorOfLayer error = error_of_sharing();
+  EXPECT_LE(error.rr, 0.04);
+  EXPECT_LE(std::fabs(error.bias), 0.01);
+  paper.microbuffer = 24;
+  EXPECT_GE(error_of_sharing().rr, 1.6 * error.rr);
+}
+
 // §3: with one receiver per cluster the factorized algorithm is the original one.
 TEST(Cornell, OneReceiverPerClusterEqualsPbgi) {
   const Scene scene = MakeCornellBox();

@@ -125,9 +125,12 @@ TEST(TreeCut, FarIsBeyondNear) {
       const NodeGroup& g = tree->group(n.slot / kLanes);
       const uint32_t k = n.slot % kLanes;
       const float d = Length(Vec3f(g.cx[k], g.cy[k], g.cz[k]) - view.position);
-      // Wholly near, or a surfel that straddles the border.
-      EXPECT_GE(view.radius_m * 1.00001f,
-                params.epsilon * (n.level == 0 ? d - g.radius[k] : d + g.radius[k]));
+      // Wholly near, or one that straddles the border and needs no descent.
+      const bool wholly = view.radius_m * 1.00001f >= params.epsilon * (d + g.radius[k]);
+      const bool fine =
+          kPif * g.radius[k] * g.radius[k] <= 1.00001f * kCutPixels * params.pixel_sr * d * d;
+      EXPECT_TRUE(wholly || fine || n.level == 0);
+      EXPECT_GE(view.radius_m * 1.00001f, params.epsilon * (d - g.radius[k]));
     }
   }
 }
@@ -177,13 +180,13 @@ TEST(TreeCut, ReceiverGoesOnWhereTheClusterStopped) {
     std::vector<uint32_t> difference;
     std::set_symmetric_difference(together.begin(), together.end(), expected.begin(),
                                   expected.end(), std::back_inserter(difference));
-    // Where the cluster had to descend further than the receiver needs (the paper's first
-    // limitation) the cut is finer; nothing else may differ.
+    // Nothing is cut finer than the receiver needs (the paper's first limitation). Hidden sides may
+    // be found lower down, since all of the cluster must not see them.
     for (const uint32_t slot : difference) {
       const int level = LevelOf(*tree, slot);
       EXPECT_TRUE(level <= 2) << level;
     }
-    EXPECT_LT(difference.size(), expected.size() / 5);
+    EXPECT_LE(difference.size(), expected.size() / 100);
   }
 }
 
