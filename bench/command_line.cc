@@ -237,7 +237,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   CLI::Option* splat_option =
       paper->add_option("--splat", splat, "opaque or coverage, in place of the paper's [opaque]")
           ->check(CLI::IsMember({"opaque", "coverage"}));
-  paper->add_option("--microbuffer", w.microbuffer, "Side of pbgi's and fpbgi's buffers [48]")
+  paper->add_option("--microbuffer", w.microbuffer, "Side of pbgi's and fpbgi's buffers [64]")
       ->check(CLI::Range(1, 256));
   paper->add_option("--light-samples", w.light_samples, "Shadow rays, as of farpoint render")
       ->capture_default_str()

@@ -36,7 +36,7 @@ struct PaperOptions {
   double reference_budget_s = 0;  // thread-seconds of each path-traced reference: 120, 2
   // In place of the preset's: what would change if the paper had chosen otherwise.
   std::optional<Splat> splat;
-  uint32_t microbuffer = 0;     // side of pbgi's and fpbgi's buffers: 48
+  uint32_t microbuffer = 0;     // side of pbgi's and fpbgi's buffers: 64
   uint32_t light_samples = 32;  // as RenderSettings
   uint64_t seed = 0;
   unsigned threads = 0;  // all cores

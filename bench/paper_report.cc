@@ -444,7 +444,7 @@ absl::StatusOr<std::string> PaperHtml(const PaperReport& r) {
   page.Facts(facts);
   page.Paragraph(
       "All integrators share scene, surfels, lights, receivers (pixel centres) and kernels, with "
-      "the paper's parameters (--preset paper: 32x32 blocks, opaque splats, 48² buffers, k = 100, "
+      "the paper's parameters (--preset paper: 32x32 blocks, opaque splats, 64² buffers, k = 100, "
       "ε = 0.1). Our times are processor seconds summed over threads; the paper's are seconds by "
       "the clock on eight cores of 2010. Compare ratios, not seconds. \"gather\" is clustering, "
       "cut, rasterization, composite and convolution; \"full\" adds primary rays and direct light, "

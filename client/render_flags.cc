@@ -311,7 +311,7 @@ constexpr auto kImage = "Image"sv, kCamera = "Camera"sv, kLights = "Lights and m
 constexpr RenderFlag kRenderFlags[] = {
     {"--preset", "NAME", kMethod,
      "paper: the paper's parameters (32x32 blocks, 100 clusters, epsilon 0.1, opaque splats, "
-     "5 iterations, 48x48 buffers; docs/paper-map.md lists what differs all the same); other flags "
+     "5 iterations, 64x64 buffers; docs/paper-map.md lists what differs all the same); other flags "
      "override it",
      [](std::string_view value, JobEdit& edit) {
        bool paper = false;

@@ -291,8 +291,10 @@ Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f&
         g = Select8(near_wins, ng, g);
         b = Select8(near_wins, nb, b);
       } else {
-        // What is far gets the room that is left, and never more than it had.
-        const F8 open = one - Load8(near->coverage() + p);
+        // What is far gets the room that is left, and never more than it had; none behind what is
+        // covered for the most part, as within one buffer.
+        const F8 near_coverage = Load8(near->coverage() + p);
+        const F8 open = Select8(near_coverage > Set8(kFullFrom), Set8(0.0f), one - near_coverage);
         const F8 far_coverage = Load8(far.coverage() + p);
         const F8 part = Select8(far_coverage > open, open / Max8(far_coverage, Set8(1e-30f)), one);
         r = nr + part * r;
@@ -303,7 +305,10 @@ Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f&
     if (splat == Splat::kCoverage) {
       // A pixel that is covered for the most part is taken for full.
       F8 c = Load8(far.coverage() + p);
-      if (near != nullptr) c = Min8(one, Load8(near->coverage() + p) + c);
+      if (near != nullptr) {
+        const F8 near_coverage = Load8(near->coverage() + p);
+        c = Select8(near_coverage > Set8(kFullFrom), near_coverage, Min8(one, near_coverage + c));
+      }
       const F8 fill = Select8(c > Set8(kFullFrom), one / Max8(c, Set8(kFullFrom)), one);
       r = r * fill;
       g = g * fill;
@@ -317,8 +322,20 @@ Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f&
   const float total = Sum8(sum_w);
   if (!(total > 0.0f)) {
     // A single pixel is the whole sphere and favours no direction: its mean radiance stands.
-    const float full = far.coverage()[0] > kFullFrom ? 1.0f / far.coverage()[0] : 1.0f;
-    const Rgb mean(far.radiance(0)[0], far.radiance(1)[0], far.radiance(2)[0]);
+    Rgb mean(far.radiance(0)[0], far.radiance(1)[0], far.radiance(2)[0]);
+    float coverage = far.coverage()[0];
+    if (near != nullptr) {
+      const Rgb own(near->radiance(0)[0], near->radiance(1)[0], near->radiance(2)[0]);
+      const float near_coverage = near->coverage()[0];
+      if (splat == Splat::kOpaque) {
+        if (near->depth()[0] < far.depth()[0]) mean = own;
+      } else {
+        const float open = near_coverage > kFullFrom ? 0.0f : 1.0f - near_coverage;
+        mean = own + mean * (coverage > open ? open / coverage : 1.0f);
+        coverage = near_coverage + std::min(open, coverage);
+      }
+    }
+    const float full = splat == Splat::kCoverage && coverage > kFullFrom ? 1.0f / coverage : 1.0f;
     return mean * (kPif * full);
   }
   const float scale = kPif / total;

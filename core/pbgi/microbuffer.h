@@ -76,10 +76,11 @@ void RasterizeCut(const PointTree& tree, const CutView& view, std::span<const Cu
 // the receiver's) from `far` seen through `near` (may be null):
 //   E = pi Σ w L / Σ w,   w = max(0, n·V_pixel),   L = L_near + min(1, (1 - C_near) / C_far) L_far
 // with coverage C = C_near + C_far, L divided by C where C > 0.75 (a pixel covered for the most
-// part is full: splats leave gaps), and the far part cut to the room that is left. Opaque splats
-// are composed by depth instead: the nearer of the two wins. A sum over all pixels
-// in a fixed order. The quotient makes a buffer of constant radiance exact for every normal. A
-// buffer of one pixel gives pi times its radiance.
+// part is full: splats leave gaps), and the far part cut to the room that is left, to nothing where
+// C_near > 0.75: what is near hides there what lies behind, as it does within one buffer. Opaque
+// splats are composed by depth instead: the nearer of the two wins. A sum over all pixels in a
+// fixed order. The quotient makes a buffer of constant radiance exact for every normal. A buffer of
+// one pixel gives pi times its radiance.
 Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f& n, Splat splat);
 
 // The literal, slow versions: oracles of the tests.

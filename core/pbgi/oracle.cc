@@ -134,9 +134,11 @@ Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const
       if (splat == Splat::kOpaque) {
         if (near->depth()[p] < far.depth()[p]) l = own;
       } else {
-        const double open = 1.0 - near->coverage()[p], c = far.coverage()[p];
+        const bool closed = near->coverage()[p] > kFullFrom;
+        const double open = closed ? 0.0 : 1.0 - near->coverage()[p];
+        const double c = far.coverage()[p];
         l = own + l * (c > open ? open / c : 1.0);
-        covered = std::min(1.0, near->coverage()[p] + c);
+        covered = closed ? near->coverage()[p] : std::min(1.0, near->coverage()[p] + c);
       }
     }
     if (splat == Splat::kCoverage && covered > 0.75) l = l / covered;

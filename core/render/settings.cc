@@ -138,8 +138,8 @@ void ApplyPaperPreset(RenderSettings& s) {
   s.epsilon = 0.1f;
   s.normal_weight = 1.0f;
   s.kmeans_iterations = 5;
-  // Of the whole sphere: above a horizon as many pixels as a hemisphere of 34x34 has.
-  s.microbuffer = 48;
+  // Of the whole sphere: above a horizon as many pixels as a hemisphere of 45x45 has.
+  s.microbuffer = 64;
 }
 
 absl::StatusOr<Integrator> IntegratorFromName(std::string_view name) {

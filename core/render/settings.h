@@ -79,7 +79,7 @@ struct RenderSettings {
 absl::Status ValidateSettings(const RenderSettings& settings);
 
 // Every parameter as in the paper: 32x32 blocks, k = 100, epsilon = 0.1, opaque splats,
-// depth composite, 5 iterations, 48x48 buffers. What differs from the paper whatever the parameters
+// depth composite, 5 iterations, 64x64 buffers. What differs from the paper whatever the parameters
 // stands in docs/paper-map.md.
 void ApplyPaperPreset(RenderSettings& settings);
 

@@ -59,7 +59,7 @@ TEST(PaperHtml, HoldsTablesPlotsAndPictures) {
   EXPECT_EQ(CountOf(*html, "<svg"), 4u);
   EXPECT_EQ(CountOf(*html, "<img"), TinyPaper()->scenes[0].pictures.size());
   for (const char* text : {"Table 1", "Figure 2", "Figures 4 and 5", "8.79e-06", "103 (98)", "8x8",
-                           "quick: a check", "2.20×", "fpbgi k=100 ε=0.1 48²"}) {
+                           "quick: a check", "2.20×", "fpbgi k=100 ε=0.1 64²"}) {
     EXPECT_THAT(*html, HasSubstr(text));
   }
   for (const char* loads : {"<script", "href=", "url(", "@import", "<link", "<iframe"}) {
@@ -90,8 +90,8 @@ TEST(PaperHtml, ScenesThatAreLeftOutAreSaidAndEscaped) {
 TEST(PaperTable, HasARowForEach) {
   ASSERT_TRUE(TinyPaper().ok()) << TinyPaper().status();
   const std::string table = PaperTable(*TinyPaper());
-  for (const char* text : {"cornell farpoint", "cornell paper", "pbgi 48px", "dpbgi",
-                           "fpbgi k=100 eps=0.1 48px", "pt, ", "8 blocks"}) {
+  for (const char* text : {"cornell farpoint", "cornell paper", "pbgi 64px", "dpbgi",
+                           "fpbgi k=100 eps=0.1 64px", "pt, ", "8 blocks"}) {
     EXPECT_THAT(table, HasSubstr(text));
   }
 }

@@ -191,7 +191,7 @@ TEST(Paper, HasAllFigures) {
   EXPECT_LT(s.fpbgi.truth.rr, 1.5);
   EXPECT_GT(s.pbgi.times.gather_error, 0);
   EXPECT_EQ(s.fpbgi.times.gather_error, 0);  // nothing of it is extrapolated
-  EXPECT_EQ(s.pbgi.microbuffer, 48u);
+  EXPECT_EQ(s.pbgi.microbuffer, 64u);
   EXPECT_EQ(s.fpbgi.clusters, 100u);
   EXPECT_EQ(s.fpbgi.epsilon, 0.1);
   EXPECT_FALSE(s.pbgi.difference.has_value());

@@ -160,6 +160,25 @@ TEST(Microbuffer, CompositeIsFarWhereNearIsOpen) {
   EXPECT_NEAR(fast.x, kPif * 0.5f * ((1.5f + 0.5f) + 0.7f), 0.05f);
 }
 
+// What is near and covers a pixel for the most part leaves gaps between its splats; nothing far may
+// shine through them.
+TEST(Microbuffer, FarIsHiddenWhereNearCoversMostOfAPixel) {
+  const MicrobufferMap map(BufferMap::kOctahedral, 16);
+  Microbuffer far(map), near(map);
+  for (uint32_t p = 0; p < map.pixels(); ++p) {
+    far.radiance(0)[p] = 100.0f;
+    far.coverage()[p] = 1.0f;
+    near.radiance(0)[p] = 0.8f * 2.0f;
+    near.coverage()[p] = 0.8f;
+  }
+  far.MarkTouched();
+  near.MarkTouched();
+  const Vec3f n = Normalize(Vec3f(1, 2, 3));
+  const Rgb fast = ConvolveCosine(far, &near, n, Splat::kCoverage);
+  EXPECT_NEAR(fast.x, kPif * 2.0f, 1e-4f);
+  EXPECT_NEAR(ConvolveCosineLiteral(far, &near, n, Splat::kCoverage).x, fast.x, 1e-4f);
+}
+
 TEST(Microbuffer, OpaqueCompositeTakesTheNearer) {
   const MicrobufferMap map(BufferMap::kOctahedral, 16);
   Microbuffer far(map), near(map);

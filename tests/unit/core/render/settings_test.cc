@@ -272,7 +272,7 @@ TEST(RenderSettings, PaperPresetIsThePapers) {
   EXPECT_EQ(s.splat, Splat::kOpaque);
   EXPECT_EQ(s.normal_weight, 1.0f);
   EXPECT_EQ(s.kmeans_iterations, 5u);
-  EXPECT_EQ(s.microbuffer_px(), 48u);
+  EXPECT_EQ(s.microbuffer_px(), 64u);
   EXPECT_EQ(s.buffer_map, BufferMap::kOctahedral);
   // It leaves alone what is the user's.
   EXPECT_EQ(s.integrator, Integrator::kPbgi);
