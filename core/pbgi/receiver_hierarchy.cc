@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "core/math/elementary.h"
 #include "core/math/sampling.h"
@@ -19,6 +20,16 @@ constexpr float kSlantedFootprints = 4.0f;
 constexpr float kAboveScale = 2.0f;
 // Keys of independent random choices.
 enum : uint64_t { kKeyJitter = 21, kKeyGather = 22 };
+// Of a world cell, at most, in a spacing's footprints.
+constexpr float kCellSide = 1.2f;
+// Levels of the pixels themselves: the records of the first tell the second where light changes.
+constexpr int kPixelLevels = 2;
+
+PixelRect Grown(const PixelRect& r, int by) { return {r.x0 - by, r.y0 - by, r.x1 + by, r.y1 + by}; }
+float ReachOf(int spacing) {
+  return std::max(kLeastScreenReach, kScreenReach * static_cast<float>(spacing));
+}
+int FloorDiv(int a, int b) { return a >= 0 ? a / b : -((b - 1 - a) / b); }
 
 struct alignas(32) Lanes {
   float x[8], y[8], z[8], nx[8], ny[8], nz[8], px[8], py[8];
@@ -28,7 +39,8 @@ struct alignas(32) Lanes {
 
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight, std::span<std::array<float, 8>> shares) {
+                  std::span<float> weight, std::span<float> spread,
+                  std::span<std::array<float, 8>> shares) {
   Lanes lanes;
   const size_t count = receivers.size();
   for (size_t i = 0; i < 8; ++i) {
@@ -93,7 +105,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     left = Max8(left, Select8(term.screen > zero, w, zero));
   }
   finest = Select8(left > zero, finest, zero);
-  F8 sum[3] = {zero, zero, zero}, weights = zero;
+  F8 sum[3] = {zero, zero, zero}, weights = zero, grey = zero, squares = zero;
   for (const Term& term : terms) {
     const GatherRecord& g = records[term.record]->gather;
     F8 w = term.rest - term.away * Max8(Set8(1.0f / g.reach_m), finest);
@@ -106,6 +118,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     const F8 dx = x - Set8(g.position.x), dy = y - Set8(g.position.y), dz = z - Set8(g.position.z);
     const F8 tx = nx - Set8(g.normal.x), ty = ny - Set8(g.normal.y), tz = nz - Set8(g.normal.z);
     weights += w;
+    F8 own = zero;
     for (int c = 0; c < 3; ++c) {
       const float e = g.irradiance[c];
       const F8 low = Set8(-0.5f * e), high = Set8(e);
@@ -115,25 +128,37 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
       const F8 turn =
           tx * Set8(g.vector[c].x) + ty * Set8(g.vector[c].y) + tz * Set8(g.vector[c].z);
       carried += Min8(Max8(turn, low), high);
-      sum[c] += w * Max8(Set8(e) + carried, zero);
+      const F8 at = Max8(Set8(e) + carried, zero);
+      own += at;
+      sum[c] += w * at;
     }
+    grey += w * own;
+    squares += w * own * own;
   }
   for (size_t i = 0; i < count; ++i) {
     weight[i] = left[i] > 0.0f ? weights[i] : 0.0f;
     const float inverse = weights[i] > 0.0f ? 1.0f / weights[i] : 0.0f;
     irradiance[i] = Rgb(sum[0][i], sum[1][i], sum[2][i]) * inverse;
+    if (!spread.empty()) {
+      const float m = grey[i] * inverse;
+      spread[i] = std::sqrt(std::max(0.0f, squares[i] * inverse - m * m)) / 3;
+    }
   }
 }
 
 ReceiverHierarchy::ReceiverHierarchy(const HierarchyParams& params, const PixelRect& frame,
-                                     const RecordSource& source)
+                                     const PlaceSource& source)
     : params_(params), frame_(frame), source_(source) {
-  for (uint32_t s = params.coarsest_px; s >= 1; s /= 2) {
+  const auto samples = [&](uint32_t s) {
     const double share =
         DetPow(static_cast<double>(s) / params.coarsest_px, static_cast<double>(params.fall_off));
-    levels_.push_back(std::make_unique<Level>(
-        static_cast<int>(s),
-        std::max(params.least_samples, static_cast<uint32_t>(share * params.coarsest_samples))));
+    return std::max(params.least_samples, static_cast<uint32_t>(share * params.coarsest_samples));
+  };
+  for (uint32_t s = params.coarsest_px; s > 1; s /= 2) {
+    levels_.push_back(std::make_unique<Level>(static_cast<int>(s), true, samples(s)));
+  }
+  for (int i = 0; i < kPixelLevels; ++i) {
+    levels_.push_back(std::make_unique<Level>(1, false, samples(1)));
   }
 }
 
@@ -146,100 +171,160 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
   std::vector<int> margin(levels_.size());
   float sum = 1;
   for (size_t l = levels_.size(); l-- > 0;) {
-    sum += kScreenReach * static_cast<float>(levels_[l]->spacing);
+    sum += ReachOf(levels_[l]->spacing);
     margin[l] = static_cast<int>(sum) + 1;
   }
   for (size_t l = 0; l < levels_.size(); ++l) {
     Level& level = *levels_[l];
     const int s = level.spacing;
-    const int m = margin[l];
-    const PixelRect region =
-        PixelRect{rect.x0 - m, rect.y0 - m, rect.x1 + m, rect.y1 + m}.Intersect(frame_);
-    View::Grid grid;
-    grid.spacing = s;
-    grid.x0 = region.x0 / s;
-    grid.y0 = region.y0 / s;
-    grid.columns = (region.x1 - 1) / s - grid.x0 + 1;
-    grid.rows = (region.y1 - 1) / s - grid.y0 + 1;
-    const size_t cells = static_cast<size_t>(grid.columns) * static_cast<size_t>(grid.rows);
-    grid.records.resize(cells);
-    const auto key_of = [&](size_t cell) {
-      const uint64_t x = static_cast<uint64_t>(grid.x0) + cell % static_cast<size_t>(grid.columns);
-      const uint64_t y = static_cast<uint64_t>(grid.y0) + cell / static_cast<size_t>(grid.columns);
-      return y << 32 | x;
+    const PixelRect region = Grown(rect, margin[l]);
+    const auto in_region = [&](float x, float y) {
+      return x >= static_cast<float>(region.x0) && x < static_cast<float>(region.x1) &&
+             y >= static_cast<float>(region.y0) && y < static_cast<float>(region.y1);
     };
-    std::vector<uint32_t> missing;
+
+    // The cells that candidates lie in, and who proposes them.
+    struct Item {
+      WorldCell cell;
+      ReceiverPlace place;  // of the candidate first, of the cell's own place then
+      bool known = false, wanted = false, chosen = false, decided = false;
+      float most_reach_m = std::numeric_limits<float>::infinity();  // by coarser neighbours
+      uint32_t first = 0, end = 0;                                  // its proposers
+      std::shared_ptr<const ScreenRecord> record;
+    };
+    const int c = level.anchored ? std::max(1, s / 2) : 1;  // spacing of candidates
+    const int shift = level.anchored ? static_cast<int>(kMostShift * static_cast<float>(s)) + 1 : 0;
+    const PixelRect asked = Grown(region, shift).Intersect(frame_);
+    const int x0 = asked.x0 / c, y0 = asked.y0 / c;
+    const int columns = (asked.x1 - 1) / c - x0 + 1, rows = (asked.y1 - 1) / c - y0 + 1;
+    struct Candidate {
+      WorldCell cell;
+      float x_px = 0, y_px = 0;
+      bool seen = false;
+      ReceiverPlace place;  // of levels that are not anchored
+    };
+    std::vector<Candidate> candidates(static_cast<size_t>(columns) * static_cast<size_t>(rows));
+    executor.ForEachPiece(candidates.size(), 64, [&](size_t begin, size_t end) {
+      for (size_t i = begin; i < end; ++i) {
+        const uint64_t column = static_cast<uint64_t>(x0) + i % static_cast<size_t>(columns);
+        const uint64_t row = static_cast<uint64_t>(y0) + i / static_cast<size_t>(columns);
+        const uint64_t side = static_cast<uint64_t>(c);
+        const uint64_t jitter = HashKey(params_.seed, kKeyJitter, row << 32 | column, side);
+        const int x = static_cast<int>(column * side + jitter % side);
+        const int y = static_cast<int>(row * side + (jitter >> 32) % side);
+        if (!frame_.Contains(x, y)) continue;
+        Candidate& candidate = candidates[i];
+        ReceiverPlace place;
+        if (!source_.ReceiverAt(x, y, place.receiver, place.footprint_m)) continue;
+        place.x_px = candidate.x_px = static_cast<float>(x) + 0.5f;
+        place.y_px = candidate.y_px = static_cast<float>(y) + 0.5f;
+        candidate.seen = true;
+        if (level.anchored) {
+          candidate.cell = CellOf(
+              place.receiver, kCellSide * static_cast<float>(s) * place.footprint_m, params_.seed);
+        } else {
+          candidate.cell.i = x;
+          candidate.cell.j = y;
+          candidate.place = place;
+        }
+      }
+    });
+    counts.candidates += candidates.size();
+    std::erase_if(candidates, [](const Candidate& candidate) { return !candidate.seen; });
+    std::stable_sort(candidates.begin(), candidates.end(),
+                     [](const Candidate& a, const Candidate& b) { return a.cell < b.cell; });
+    std::vector<Item> items;
+    for (uint32_t i = 0; i < candidates.size(); ++i) {
+      if (i == 0 || !(candidates[i].cell == candidates[i - 1].cell)) {
+        Item& item = items.emplace_back();
+        item.cell = candidates[i].cell;
+        item.place = candidates[i].place;
+        item.first = i;
+      }
+      items.back().end = i + 1;
+    }
     {
       const std::lock_guard lock(level.mutex);
-      for (uint32_t c = 0; c < cells; ++c) {
-        const auto it = level.records.find(key_of(c));
-        if (it != level.records.end()) {
-          grid.records[c] = it->second;
-        } else {
-          missing.push_back(c);
-        }
+      for (Item& item : items) {
+        const auto it = level.records.find(item.cell);
+        if (it == level.records.end()) continue;
+        item.known = true;
+        item.record = it->second;
       }
     }
 
     // Who needs a record …
-    struct Candidate {
-      bool chosen = false;
-      Receiver receiver;
-      float x_px = 0, y_px = 0;
-      float footprint_m = 0;
-      float most_reach_m = std::numeric_limits<float>::infinity();  // by coarser neighbours
-    };
-    std::vector<Candidate> candidates(missing.size());
-    executor.ForEachPiece(missing.size(), 64, [&](size_t begin, size_t end) {
+    executor.ForEachPiece(items.size(), 16, [&](size_t begin, size_t end) {
       std::vector<const ScreenRecord*> near;
       for (size_t i = begin; i < end; ++i) {
-        const uint64_t key = key_of(missing[i]);
-        const uint64_t jitter = HashKey(params_.seed, kKeyJitter, key, static_cast<uint64_t>(s));
-        const uint64_t side = static_cast<uint64_t>(s);
-        const int x = static_cast<int>((key & 0xffffffffu) * side + jitter % side);
-        const int y = static_cast<int>((key >> 32) * side + (jitter >> 32) % side);
-        if (!frame_.Contains(x, y)) continue;
-        Candidate& c = candidates[i];
-        if (!source_.ReceiverAt(x, y, c.receiver, c.footprint_m)) continue;
-        c.x_px = static_cast<float>(x) + 0.5f;
-        c.y_px = static_cast<float>(y) + 0.5f;
-        c.chosen = true;
+        Item& item = items[i];
+        ReceiverPlace& place = item.place;
+        if (item.known) {
+          if (!item.record) continue;
+          place.x_px = item.record->x_px;
+          place.y_px = item.record->y_px;
+        } else if (level.anchored &&
+                   !source_.ReceiverAlong(ProbeOf(item.cell, params_.seed), place)) {
+          item.decided = true;
+          continue;
+        }
+        if (!in_region(place.x_px, place.y_px)) continue;
+        if (level.anchored) {
+          const float most = kMostShift * static_cast<float>(s);
+          const bool close = std::any_of(candidates.begin() + item.first,
+                                         candidates.begin() + item.end, [&](const Candidate& by) {
+                                           const float dx = by.x_px - place.x_px,
+                                                       dy = by.y_px - place.y_px;
+                                           return dx * dx + dy * dy <= most * most;
+                                         });
+          if (!close) continue;
+        }
+        item.wanted = true;
+        if (item.known) continue;
+        item.chosen = true;
         if (l == 0) continue;
         near.clear();
+        const int x = static_cast<int>(std::floor(place.x_px));
+        const int y = static_cast<int>(std::floor(place.y_px));
         view->Collect({x, y, x + 1, y + 1}, near);
-        const ServedReceiver served{&c.receiver, c.x_px, c.y_px};
+        const ServedReceiver served{&place.receiver, place.x_px, place.y_px};
         Rgb irradiance;
-        float weight;
-        BlendRecords(near, {&served, 1}, {&irradiance, 1}, {&weight, 1});
-        c.chosen = !(weight >= params_.enough);
+        float weight, spread = 0;
+        BlendRecords(near, {&served, 1}, {&irradiance, 1}, {&weight, 1}, {&spread, 1});
+        item.chosen =
+            !(weight >= params_.enough) || (params_.spread_wm2 > 0 && spread > params_.spread_wm2);
+        item.decided = !item.chosen && level.anchored;
         for (const ScreenRecord* r : near) {
-          c.most_reach_m = std::min(
-              c.most_reach_m, r->gather.reach_m + Length(r->gather.position - c.receiver.position));
+          item.most_reach_m =
+              std::min(item.most_reach_m,
+                       r->gather.reach_m + Length(r->gather.position - place.receiver.position));
         }
       }
     });
-    counts.candidates += missing.size();
 
     // … gets one.
     std::vector<uint32_t> made;
-    for (uint32_t i = 0; i < missing.size(); ++i) {
-      if (candidates[i].chosen) made.push_back(i);
+    for (uint32_t i = 0; i < items.size(); ++i) {
+      if (items[i].chosen) made.push_back(i);
     }
     std::atomic<bool> stopped{false};
     std::atomic<size_t> done{0};
     executor.ForEach(made.size(), 1, [&](size_t i) {
       if (stopped.load(std::memory_order_relaxed)) return;
-      const Candidate& c = candidates[made[i]];
-      const uint32_t cell = missing[made[i]];
+      Item& item = items[made[i]];
       auto record = std::make_shared<ScreenRecord>();
-      record->x_px = c.x_px;
-      record->y_px = c.y_px;
-      record->screen_reach_px = kScreenReach * static_cast<float>(s);
+      record->x_px = item.place.x_px;
+      record->y_px = item.place.y_px;
+      record->screen_reach_px = ReachOf(s);
       GatherRecord& g = record->gather;
-      g = source_.Gather(c.receiver, level.grid,
-                         HashKey(params_.seed, kKeyGather, key_of(cell), static_cast<uint64_t>(s)));
-      SetReach(c.footprint_m, c.most_reach_m, *record);
-      grid.records[cell] = std::move(record);
+      // A pixel's record has the key of its place, too.
+      const WorldCell cell =
+          level.anchored ? item.cell
+                         : CellOf(item.place.receiver, item.place.footprint_m, params_.seed);
+      g = source_.Gather(item.place.receiver, level.grid,
+                         HashKey(HashOf(cell, params_.seed), kKeyGather, static_cast<uint64_t>(l)));
+      SetReach(item.place.footprint_m, item.most_reach_m, *record);
+      item.record = std::move(record);
       const double part = static_cast<double>(++done) / static_cast<double>(made.size());
       if (go_on && !go_on((static_cast<double>(l) + part) / static_cast<double>(levels_.size()))) {
         stopped = true;
@@ -250,10 +335,36 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     counts.samples += made.size() * uint64_t{level.grid.size()};
     {
       const std::lock_guard lock(level.mutex);
-      if (level.records.size() + made.size() > kKeptRecords) level.records.clear();
-      for (const uint32_t i : made) {
-        level.records.try_emplace(key_of(missing[i]), grid.records[missing[i]]);
+      if (level.records.size() + items.size() > kKeptRecords) level.records.clear();
+      for (const Item& item : items) {
+        if (item.chosen || item.decided) level.records.try_emplace(item.cell, item.record);
       }
+    }
+
+    // In bins; within a bin in the order of the cells.
+    View::Grid grid;
+    grid.spacing = s;
+    grid.x0 = FloorDiv(region.x0, s);
+    grid.y0 = FloorDiv(region.y0, s);
+    grid.columns = FloorDiv(region.x1 - 1, s) - grid.x0 + 1;
+    grid.rows = FloorDiv(region.y1 - 1, s) - grid.y0 + 1;
+    const auto bin_of = [&](const ScreenRecord& r) {
+      const int x = FloorDiv(static_cast<int>(std::floor(r.x_px)), s) - grid.x0;
+      const int y = FloorDiv(static_cast<int>(std::floor(r.y_px)), s) - grid.y0;
+      return static_cast<size_t>(y) * static_cast<size_t>(grid.columns) + static_cast<size_t>(x);
+    };
+    grid.first.assign(static_cast<size_t>(grid.columns) * static_cast<size_t>(grid.rows) + 1, 0);
+    uint32_t records = 0;
+    for (const Item& item : items) {
+      if (!item.wanted || !item.record) continue;
+      ++grid.first[bin_of(*item.record) + 1];
+      ++records;
+    }
+    for (size_t i = 1; i < grid.first.size(); ++i) grid.first[i] += grid.first[i - 1];
+    grid.records.resize(records);
+    std::vector<uint32_t> at(grid.first.begin(), grid.first.end() - 1);
+    for (const Item& item : items) {
+      if (item.wanted && item.record) grid.records[at[bin_of(*item.record)]++] = item.record;
     }
     view->grids_.push_back(std::move(grid));
   }
@@ -265,7 +376,7 @@ ScreenRecord ReceiverHierarchy::MakeOwnRecord(const ServedReceiver& receiver, fl
   ScreenRecord record;
   record.x_px = receiver.x_px;
   record.y_px = receiver.y_px;
-  record.screen_reach_px = kScreenReach;
+  record.screen_reach_px = ReachOf(1);
   record.gather = source_.Gather(*receiver.receiver, levels_.back()->grid,
                                  HashKey(params_.seed, kKeyGather, key, 0));
   SetReach(footprint_m, std::numeric_limits<float>::infinity(), record);
@@ -299,7 +410,7 @@ void ReceiverHierarchy::View::Collect(const PixelRect& rect,
                                       std::vector<const ScreenRecord*>& out) const {
   for (const Grid& grid : grids_) {
     const float s = static_cast<float>(grid.spacing);
-    const float reach = kScreenReach * s;
+    const float reach = ReachOf(grid.spacing);
     const int x0 =
         std::max(grid.x0, static_cast<int>(std::floor((static_cast<float>(rect.x0) - reach) / s)));
     const int y0 =
@@ -310,12 +421,11 @@ void ReceiverHierarchy::View::Collect(const PixelRect& rect,
     const int y1 =
         std::min(grid.y0 + grid.rows - 1,
                  static_cast<int>(std::floor((static_cast<float>(rect.y1) + reach) / s)));
-    for (int y = y0; y <= y1; ++y) {
-      for (int x = x0; x <= x1; ++x) {
-        const auto& record =
-            grid.records[static_cast<size_t>(y - grid.y0) * static_cast<size_t>(grid.columns) +
-                         static_cast<size_t>(x - grid.x0)];
-        if (!record) continue;
+    for (int y = y0; y <= y1 && x0 <= x1; ++y) {
+      const size_t row = static_cast<size_t>(y - grid.y0) * static_cast<size_t>(grid.columns);
+      const uint32_t end = grid.first[row + static_cast<size_t>(x1 - grid.x0) + 1];
+      for (uint32_t i = grid.first[row + static_cast<size_t>(x0 - grid.x0)]; i < end; ++i) {
+        const auto& record = grid.records[i];
         // Distance from the record to the rectangle.
         const float dx = std::max({static_cast<float>(rect.x0) - record->x_px, 0.0f,
                                    record->x_px - static_cast<float>(rect.x1)});

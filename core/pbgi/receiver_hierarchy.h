@@ -2,18 +2,23 @@
 // receivers blend them. It stands in for the paper's k clusters per block (§3.1) and is what its
 // §5 names as future work: clusters follow the scene's complexity, not the number of pixels.
 //
-// Level l has a grid of cells of s_l = coarsest / 2^l pixels over the frame, down to 1. Each cell
-// has one candidate pixel, jittered within the cell by the cell's coordinates. A candidate becomes
-// a cluster's active receiver, and its record is gathered, where the summed weight of all records
-// of coarser levels is below `enough`. A record of level l weighs only within kScreenReach s_l
-// pixels, so what a record is depends on its own pixel and on coarser records near it: never on
-// tiles, threads or order. The finest level's candidates are the pixels themselves, so every
+// Level l has the spacing s_l = coarsest / 2^l pixels, down to 2; on these levels clusters are
+// anchored to the scene. Candidates, one in each square of s_l / 2 pixels of the frame, jittered by
+// the square's coordinates, propose the world cells (core/pbgi/world_cell.h) that they lie in, of a
+// side of about s_l pixels' footprints. A cell's place is its active receiver, and a record is
+// gathered there, where the records of coarser levels weigh less than `enough` in sum or disagree
+// by more than `spread_wm2`. So a camera that moves finds the same places, and the same rays from
+// them, again. A place counts if a candidate within kMostShift s_l pixels proposes it. The pixels
+// themselves follow, twice: the second time the records of the first tell of what is near. Every
 // receiver at a pixel's centre is served.
+// A record of level l weighs only within ρ = max(kScreenReach s_l, kLeastScreenReach) pixels, so
+// what a record is depends on the scene, the frame's camera and coarser records near it: never on
+// tiles, threads or order.
 //
 // The weight of record k at a receiver x with normal n, at point p of the image:
 //   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / min(a, b) - sqrt((1 - n·n_c) /
 //   kNormalTolerance))²
-//       · max(0, 1 - |p - p_c|² / ρ²)²,   ρ = kScreenReach s_l,
+//       · max(0, 1 - |p - p_c|² / ρ²)²,
 // continuous and of compact support in all of its arguments (but for b where it is lifted). The
 // reach a is `reach` times the harmonic mean distance of what the record saw, at most E / (2 |∇E|),
 // at most a coarser neighbour's reach plus the distance to it, at least `floor_px` pixels'
@@ -41,10 +46,13 @@
 #include "core/image/tile_rect.h"
 #include "core/pbgi/gather_record.h"
 #include "core/pbgi/receiver_cluster.h"
+#include "core/pbgi/world_cell.h"
 
 namespace farpoint {
 
-inline constexpr float kScreenReach = 1.5f;      // of a record, in spacings of its level
+inline constexpr float kScreenReach = 1.5f;       // of a record, in spacings of its level
+inline constexpr float kLeastScreenReach = 3.0f;  // pixels
+inline constexpr float kMostShift = 1.5f;         // of a place from a candidate in it, in spacings
 inline constexpr float kNormalTolerance = 0.3f;  // 1 - cos of the angle at which weights end (46°)
 
 struct HierarchyParams {
@@ -54,11 +62,21 @@ struct HierarchyParams {
   uint32_t least_samples = 64;
   float reach = 0.15f;   // a over the harmonic mean distance
   float enough = 0.25f;  // summed weight that spares a receiver a record of its own
-  float floor_px = 4;    // least a, in pixels' footprints, see above
+  float floor_px = 3;    // least a, in pixels' footprints, see above
+  // Standard deviation among records that spares a receiver a record of its own, W/m², mean of the
+  // channels; 0: any does.
+  float spread_wm2 = 0;
   uint64_t seed = 0;
 };
 
-// What the hierarchy needs of a renderer. Thread-safe.
+// A receiver that no pixel's centre shows, perhaps.
+struct ReceiverPlace {
+  Receiver receiver;
+  float footprint_m = 0;     // side of a pixel at its depth
+  float x_px = 0, y_px = 0;  // where it lies in the image, or beside it
+};
+
+// What those that place records need of a renderer. Thread-safe.
 class RecordSource {
  public:
   virtual ~RecordSource() = default;
@@ -68,6 +86,14 @@ class RecordSource {
   // All but reach_m; a function of its arguments.
   virtual GatherRecord Gather(const Receiver& receiver, const HemisphereGrid& grid,
                               uint64_t key) const = 0;
+};
+
+class PlaceSource : public RecordSource {
+ public:
+  // The surface that the probe meets first, turned towards where the probe comes from. False: none,
+  // or the camera does not see that side of it there: what is buried would carry its dark to what
+  // lies over it.
+  virtual bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const = 0;
 };
 
 struct ScreenRecord {
@@ -84,17 +110,18 @@ struct ServedReceiver {
 
 // Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs (see b
 // for where only b is why). What a receiver gets depends on the records that weigh on it and on
-// their order, not on the other receivers. `shares`: none, or for each record its w at each
-// receiver.
+// their order, not on the other receivers. `spread`: none, or the weighted standard deviation of
+// E(x, n), mean of the channels. `shares`: none, or for each record its w at each receiver.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight, std::span<std::array<float, 8>> shares = {});
+                  std::span<float> weight, std::span<float> spread = {},
+                  std::span<std::array<float, 8>> shares = {});
 
 class ReceiverHierarchy {
  public:
   // `source` must outlive the hierarchy.
   ReceiverHierarchy(const HierarchyParams& params, const PixelRect& frame,
-                    const RecordSource& source);
+                    const PlaceSource& source);
 
   // The records that can weigh on receivers within a rectangle.
   class View {
@@ -105,7 +132,8 @@ class ReceiverHierarchy {
    private:
     friend class ReceiverHierarchy;
     struct Grid {
-      int spacing, x0, y0, columns, rows;  // in cells
+      int spacing, x0, y0, columns, rows;  // in bins of spacing²
+      std::vector<uint32_t> first;         // of each bin, and the end of the last
       std::vector<std::shared_ptr<const ScreenRecord>> records;
     };
     std::vector<Grid> grids_;  // by level
@@ -135,18 +163,21 @@ class ReceiverHierarchy {
 
  private:
   struct Level {
-    Level(int spacing_px, uint32_t samples) : spacing(spacing_px), grid(samples) {}
+    Level(int spacing_px, bool in_world, uint32_t samples)
+        : spacing(spacing_px), anchored(in_world), grid(samples) {}
     const int spacing;
+    const bool anchored;  // to world cells; else to pixels
     const HemisphereGrid grid;
     std::mutex mutex;
-    std::unordered_map<uint64_t, std::shared_ptr<const ScreenRecord>> records;  // by cell
+    // Null: none is needed. Of pixels only those that have one.
+    std::unordered_map<WorldCell, std::shared_ptr<const ScreenRecord>, WorldCellHash> records;
   };
 
   void SetReach(float footprint_m, float most_reach_m, ScreenRecord& record) const;
 
   const HierarchyParams params_;
   const PixelRect frame_;
-  const RecordSource& source_;
+  const PlaceSource& source_;
   std::vector<std::unique_ptr<Level>> levels_;
 };
 

@@ -93,7 +93,8 @@ const SurfelGrid::Cell* SurfelGrid::FindCell(uint64_t key) const {
   return &cells_[at];
 }
 
-std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front) const {
+std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
+                                    Vec3f* where) const {
   if (entries_.empty()) return std::nullopt;
   const Vec3f q = (p - low_) * inverse_cell_ - Vec3f(0.5f);
   const int64_t x0 = static_cast<int64_t>(std::floor(q.x));
@@ -108,6 +109,7 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front) 
   const float farthest = spacing_m_ * spacing_m_ * 2.25f;
   float best[2] = {farthest, farthest};
   uint32_t found[2] = {~0u, ~0u};
+  Vec3f place[2];
   // Of those within a spacing, of each winding.
   float darkest[2] = {std::numeric_limits<float>::infinity(),
                       std::numeric_limits<float>::infinity()};
@@ -138,11 +140,13 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front) 
       if (!(d2 < best[turned])) continue;
       best[turned] = d2;
       found[turned] = slot;
+      place[turned] = entries_[e].position;
     }
   }
   const int turned = found[0] != ~0u ? 0 : 1;
   if (found[turned] == ~0u) return std::nullopt;
   if (darkest[turned] < kLeastContrast * brightest[turned]) return std::nullopt;
+  if (where != nullptr) *where = place[turned];
   const uint32_t slot = found[turned];
   const RadianceGroup::Sides& sides = tree_.radiance(first + slot / kLanes).lane[slot % kLanes];
   return front == (turned == 0) ? sides.front : sides.back;
@@ -156,6 +160,9 @@ constexpr uint64_t kResolved = uint64_t{1} << 63;
 constexpr uint64_t kNone = uint64_t{1} << 62;
 constexpr int kMantissaBits = 17;
 constexpr uint64_t kMantissaMask = (uint64_t{1} << kMantissaBits) - 1;
+
+// Of what may stand between a texel and its surfel unseen, in spacings.
+constexpr float kLift = 0.1f;
 
 uint64_t Encode(const Rgb& c) {
   const float most = MaxComponent(c);
@@ -186,8 +193,9 @@ Rgb Decode(uint64_t word) {
 
 void SurfelAtlas::FreeDeleter::operator()(void* p) const { std::free(p); }
 
-SurfelAtlas::SurfelAtlas(const PreparedScene& scene, const PointTree& tree)
-    : scene_(scene), grid_(tree) {
+SurfelAtlas::SurfelAtlas(const RayAccel& accel, const PointTree& tree)
+    : accel_(accel), scene_(accel.scene()), grid_(tree) {
+  const PreparedScene& scene = scene_;
   const size_t count = scene.triangles().size();
   patches_.resize(count);
   if (!(grid_.spacing_m() > 0.0f)) return;
@@ -217,17 +225,37 @@ uint64_t SurfelAtlas::Resolve(uint32_t triangle, uint32_t column, uint32_t row, 
   // image of one that does (see Radiance), whose upper half it is.
   const bool upper = column + row >= side;
   const float inverse = 1.0f / static_cast<float>(side);
-  float b1, b2;
-  if (upper) {
-    b1 = (static_cast<float>(side - 1 - column) + 2.0f / 3) * inverse;
-    b2 = (static_cast<float>(side - 1 - row) + 2.0f / 3) * inverse;
-  } else {
-    b1 = (static_cast<float>(column) + 1.0f / 3) * inverse;
-    b2 = (static_cast<float>(row) + 1.0f / 3) * inverse;
+  const float u = static_cast<float>(upper ? side - 1 - column : column);
+  const float v = static_cast<float>(upper ? side - 1 - row : row);
+  const auto at = [&](float du, float dv) {
+    return scene_.PointOn(triangle, (u + du) * inverse, (v + dv) * inverse);
+  };
+  const float middle = upper ? 2.0f / 3 : 1.0f / 3;
+  const Vec3f n = scene_.GeometricNormal(triangle), out = front ? n : -n;
+  const Vec3f p = at(middle, middle);
+  Vec3f surfel;
+  const std::optional<Rgb> found = grid_.Find(p, n, front, &surfel);
+  if (!found) return kResolved | kNone;
+  const Vec3f lifted = accel_.LeaveSurface(p, out);
+  const auto cut_off = [&](const Vec3f& from, const Vec3f& to) {
+    const Vec3f d = to - from;
+    const float length = Length(d);
+    return length > 0.0f && accel_.Occluded(from, d / length, length);
+  };
+  // What cuts through the half cuts two of its sides, so two of them tell. A little within them:
+  // there another surface may begin.
+  constexpr float kInside = 0.9f;
+  Vec3f corner[3];
+  for (int i = 0; i < 3; ++i) {
+    const float a = i == 1 ? 1.0f : 0.0f, b = i == 2 ? 1.0f : 0.0f;
+    const Vec3f end = upper ? at(1 - a, 1 - b) : at(a, b);
+    corner[i] = lifted + (end - p) * kInside;
   }
-  const Vec3f n = scene_.GeometricNormal(triangle);
-  const std::optional<Rgb> found = grid_.Find(scene_.PointOn(triangle, b1, b2), n, front);
-  return found ? Encode(*found) : kResolved | kNone;
+  if (cut_off(corner[1], corner[0]) || cut_off(corner[0], corner[2])) return kResolved | kNone;
+  // The surfel may lie on another triangle: over the edge between them, if it is not too sharp.
+  const Vec3f lift = out * (kLift * grid_.spacing_m());
+  if (cut_off(p + lift, surfel + lift)) return kResolved | kNone;
+  return Encode(*found);
 }
 
 std::optional<Rgb> SurfelAtlas::Radiance(uint32_t triangle, float b1, float b2, bool front) const {

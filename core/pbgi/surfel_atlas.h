@@ -9,6 +9,7 @@
 #include <optional>
 #include <vector>
 
+#include "core/accel/ray_accel.h"
 #include "core/math/vec.h"
 #include "core/pbgi/point_tree.h"
 #include "core/scene/prepared_scene.h"
@@ -26,7 +27,8 @@ class SurfelGrid {
   // of a spacing of p, of those that look along n if there are any, else of those that look
   // against it; none if there is none, and where those within one spacing differ more than
   // fourfold.
-  std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front) const;
+  // `where`: none, or gets the surfel's position.
+  std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front, Vec3f* where = nullptr) const;
 
   // sqrt(mean area of a surfel); 0 for an empty tree.
   float spacing_m() const { return spacing_m_; }
@@ -54,12 +56,15 @@ class SurfelGrid {
 // it, and when.
 class SurfelAtlas {
  public:
-  // Scene and tree must belong together and outlive the atlas. 16 bytes a texel, of memory that is
-  // touched when it is read; at most kMaxTexels (then texels are larger than surfels).
-  SurfelAtlas(const PreparedScene& scene, const PointTree& tree);
+  // The tree must be of the accelerated scene; both must outlive the atlas. 16 bytes a texel, of
+  // memory that is touched when it is read; at most kMaxTexels (then texels are larger than
+  // surfels).
+  SurfelAtlas(const RayAccel& accel, const PointTree& tree);
 
   // The radiance at the point (b1, b2) of `triangle` on the side of its front (winding) or back, as
   // SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits below the largest channel.
+  // None, too, where something stands on the texel, or between it and the surfel: the light on its
+  // other side is another.
   std::optional<Rgb> Radiance(uint32_t triangle, float b1, float b2, bool front) const;
 
   float spacing_m() const { return grid_.spacing_m(); }
@@ -76,6 +81,7 @@ class SurfelAtlas {
   uint64_t Resolve(uint32_t triangle, uint32_t column, uint32_t row, uint32_t side,
                    bool front) const;
 
+  const RayAccel& accel_;
   const PreparedScene& scene_;
   SurfelGrid grid_;
   std::vector<Patch> patches_;  // by triangle

@@ -32,6 +32,19 @@ class CameraRays {
     const double depth = Dot(Vec3d(p) - eye_, forward_);
     return static_cast<float>((depth < 0 ? -depth : depth) * 2.0 * half_height_ / height_);
   }
+  // Where p lies in the raster, in pixels, perhaps outside it. False: not before the camera.
+  bool RasterOf(const Vec3f& p, float& x, float& y) const {
+    const Vec3d d = Vec3d(p) - eye_;
+    const double depth = Dot(d, forward_);
+    if (!(depth > 0)) return false;
+    const double scale = height_ / (2 * half_height_ * depth);
+    const double u = Dot(d, right_) * scale, v = Dot(d, up_) * scale;
+    constexpr double kFar = 1 << 20;  // of a raster
+    if (!(u < kFar && u > -kFar && v < kFar && v > -kFar)) return false;
+    x = static_cast<float>(0.5 * width_ + u);
+    y = static_cast<float>(0.5 * height_ - v);
+    return true;
+  }
   // Distance along the camera's axis.
   float Depth(const Vec3f& p) const { return static_cast<float>(Dot(Vec3d(p) - eye_, forward_)); }
 

@@ -29,6 +29,10 @@ namespace {
 // Samples that records serve with less weight than this get their own.
 constexpr float kServed = 0.02f;
 
+// Standard deviation among the records at a receiver that asks for one more, in parts of the
+// frame's mean irradiance.
+constexpr float kMostSpread = 0.15f;
+
 // Keys of independent random choices.
 enum : uint64_t { kKeyPixel = 1, kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
 
@@ -151,10 +155,6 @@ class Renderer final : public FrameRenderer {
         settings_.integrator == Integrator::kIrrcache) {
       gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
     }
-    if (settings_.adaptive()) {
-      hierarchy_ = std::make_unique<ReceiverHierarchy>(HierarchyOf(settings_), frame_.film.frame(),
-                                                       *gatherer_);
-    }
     wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
   }
 
@@ -172,7 +172,7 @@ class Renderer final : public FrameRenderer {
     std::atomic<bool> finite{true}, cancelled{false};
     std::mutex progress_mutex;
     int done = 0;
-    const bool in_two_halves = hierarchy_ != nullptr || NeedsCache();
+    const bool in_two_halves = settings_.adaptive() || NeedsCache();
     const int total = static_cast<int>(blocks.size()) * (in_two_halves ? 2 : 1);
     int reported = 0;
     const auto go_on = [&](double part) {
@@ -187,10 +187,12 @@ class Renderer final : public FrameRenderer {
     if (NeedsHierarchy()) {
       const double cpu = ProcessCpuSeconds();
       ReceiverHierarchy::Counts counts;
-      std::call_once(refined_, [&] {
-        if (settings_.fill_in_force() == Fill::kRays) {
-          gatherer_->Refine(NoiseOf(settings_), frame_.film.frame(), executor);
-        }
+      std::call_once(scaled_, [&] {
+        const float mean = gatherer_->MeanIrradiance(frame_.film.frame(), executor);
+        HierarchyParams params = HierarchyOf(settings_);
+        params.spread_wm2 = kMostSpread * mean;
+        gatherer_->Refine(NoiseOf(settings_) * mean);
+        hierarchy_ = std::make_unique<ReceiverHierarchy>(params, frame_.film.frame(), *gatherer_);
       });
       view = hierarchy_->Prepare(tile, executor, go_on, counts);
       Stats stats = gatherer_->TakeStats();
@@ -404,7 +406,7 @@ class Renderer final : public FrameRenderer {
 
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
-    return hierarchy_ != nullptr && wants_indirect_ &&
+    return settings_.adaptive() && wants_indirect_ &&
            (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
@@ -466,6 +468,13 @@ class Renderer final : public FrameRenderer {
     stats += gatherer_->TakeStats();
   }
 
+  // Of the pixel of a record's place, or the nearest within the frame.
+  float PixelIndex(float x_px, float y_px) const {
+    const int x = std::clamp(static_cast<int>(x_px), 0, frame_.film.width - 1);
+    const int y = std::clamp(static_cast<int>(y_px), 0, frame_.film.height - 1);
+    return static_cast<float>(y) * static_cast<float>(frame_.film.width) + static_cast<float>(x);
+  }
+
   // Adaptive clusters: receivers blend the records about them.
   void Blend(const ReceiverHierarchy::View& view, const PixelRect& block,
              std::vector<Sample>& samples, const std::vector<Receiver>& receivers,
@@ -502,7 +511,7 @@ class Renderer final : public FrameRenderer {
                        static_cast<float>(block.y0 + pixel / block.width()) + 0.5f};
         }
         if (wants_cluster_) shares.resize(records.size());
-        BlendRecords(records, {served, count}, {e, count}, {weight, count}, shares);
+        BlendRecords(records, {served, count}, {e, count}, {weight, count}, {}, shares);
         for (size_t i = 0; i < count; ++i) {
           Sample& sample = samples[sample_of[groups[g][at + i]]];
           sample.indirect_e = e[i];
@@ -514,8 +523,7 @@ class Renderer final : public FrameRenderer {
             ++sample.cut_size;
             if (share > sample.heaviest) {
               sample.heaviest = share;
-              sample.cluster = (records[k]->y_px - 0.5f) * static_cast<float>(frame_.film.width) +
-                               (records[k]->x_px - 0.5f);
+              sample.cluster = PixelIndex(records[k]->x_px, records[k]->y_px);
             }
           }
         }
@@ -812,8 +820,8 @@ class Renderer final : public FrameRenderer {
   HemisphereGrid ray_grid_;  // of k clusters per block filled by rays
   CutParams cut_params_;
   std::unique_ptr<RecordGatherer> gatherer_;
-  mutable std::once_flag refined_;                // on the first tile that needs it
-  std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
+  mutable std::once_flag scaled_;                         // on the first tile that needs it:
+  mutable std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
   mutable std::mutex cache_mutex_;
   mutable std::unique_ptr<const IrradianceCache> cache_;  // irrcache
   bool wants_cluster_;

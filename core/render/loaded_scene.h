@@ -21,7 +21,7 @@ class LoadedSceneData final : public LoadedScene {
 
   // Made when it is first asked for; `tree` must be there.
   const SurfelAtlas& Atlas() const {
-    std::call_once(atlas_once_, [this] { atlas_ = std::make_unique<SurfelAtlas>(*scene, *tree); });
+    std::call_once(atlas_once_, [this] { atlas_ = std::make_unique<SurfelAtlas>(*accel, *tree); });
     return *atlas_;
   }
 

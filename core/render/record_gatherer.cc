@@ -151,15 +151,31 @@ bool RecordGatherer::ReceiverAt(int x, int y, Receiver& receiver, float& footpri
   return true;
 }
 
+bool RecordGatherer::ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const {
+  const std::optional<RayHit> hit =
+      scene_.accel->Intersect(probe.origin, probe.direction, probe.length_m);
+  if (!hit) return false;
+  place.receiver = ReceiverOfHit(*scene_.scene, *hit, probe.direction);
+  place.footprint_m = rays_.FootprintAt(place.receiver.position);
+  const Vec3f to_eye = rays_.eye() - place.receiver.position;
+  const float distance = Length(to_eye);
+  if (!(Dot(to_eye, place.receiver.geometric_normal) > 0.0f)) return false;
+  if (scene_.accel->Occluded(
+          scene_.accel->LeaveSurface(place.receiver.position, place.receiver.geometric_normal),
+          to_eye / distance, distance)) {
+    return false;
+  }
+  return rays_.RasterOf(place.receiver.position, place.x_px, place.y_px);
+}
+
 GatherRecord RecordGatherer::Gather(const Receiver& receiver, const HemisphereGrid& grid,
                                     uint64_t key) const {
   return settings_.fill_in_force() == Fill::kCut ? GatherByCut(receiver, grid)
                                                  : GatherByRays(receiver, grid, key);
 }
 
-void RecordGatherer::Refine(float noise, const PixelRect& frame, Executor& executor) {
-  least_share_ = 0;
-  if (!(noise > 0) || frame.empty()) return;
+float RecordGatherer::MeanIrradiance(const PixelRect& frame, Executor& executor) const {
+  if (frame.empty()) return 0;
   const int pilots = static_cast<int>(
       std::clamp<int64_t>(frame.area() / kPixelsPerPilot, kLeastPilots, kMostPilots));
   const int side =
@@ -188,7 +204,14 @@ void RecordGatherer::Refine(float noise, const PixelRect& frame, Executor& execu
     sum += e;
     ++count;
   }
-  if (count > 0) least_share_ = static_cast<float>(sum / count) * noise;
+  if (!(sum > 0)) return 0;
+  int octave;
+  const double mantissa = std::frexp(sum / count, &octave);  // in [1/2, 1)
+  double rounded = 0.5;
+  for (const double step : {0.5946035575013605, 0.7071067811865476, 0.8408964152537145}) {
+    if (mantissa >= step) rounded = step;
+  }
+  return static_cast<float>(std::ldexp(rounded, octave));
 }
 
 GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const HemisphereGrid& grid,

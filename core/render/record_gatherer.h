@@ -20,19 +20,23 @@ namespace farpoint {
 // (one shadow ray per light). The irradiance cache shades every point, as `pt` does. By cuts: the
 // receiver's own cut from the root (§1.1), rasterized into its microbuffer, whose pixels then stand
 // for the strata.
-class RecordGatherer final : public RecordSource {
+class RecordGatherer final : public PlaceSource {
  public:
   // All must outlive the gatherer. `settings.fill` decides the way.
   RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
                  const RenderSettings& settings, const MicrobufferMap& map,
                  const CutParams& cut_params);
 
-  // From now on strata are refined: `noise` times the mean irradiance (of the three channels) at a
-  // few hundred receivers of `frame`, which are gathered here; 0, or nothing seen, is none. Not to
-  // be called while others gather.
-  void Refine(float noise, const PixelRect& frame, Executor& executor);
+  // The mean irradiance (of the three channels, W/m²) at a few hundred receivers of `frame`, which
+  // are gathered here, rounded to quarters of an octave so that it is the same in most frames of a
+  // sequence; 0: nothing seen.
+  float MeanIrradiance(const PixelRect& frame, Executor& executor) const;
+  // From now on strata are refined down to this standard deviation, W/m²; 0: none are. Not to be
+  // called while others gather.
+  void Refine(float deviation_wm2) { least_share_ = deviation_wm2; }
 
   bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
+  bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override;
   GatherRecord Gather(const Receiver& receiver, const HemisphereGrid& grid,
                       uint64_t key) const override;
 

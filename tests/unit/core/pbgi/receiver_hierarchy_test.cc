@@ -12,15 +12,25 @@ namespace farpoint {
 namespace {
 
 // A floor seen from above, one metre a pixel, with a step at x = 40 and a pole of background; its
-// irradiance is linear in x, and records know its slope.
-class Floor final : public RecordSource {
+// irradiance is linear in x, and records know its slope. Pixel (0, 0) begins at (shift, 0).
+class Floor final : public PlaceSource {
  public:
+  explicit Floor(float shift_m = 0) : shift_m_(shift_m) {}
+
   bool ReceiverAt(int x, int y, Receiver& r, float& footprint_m) const override {
-    if (x >= 20 && x < 23 && y < 30) return false;
-    r = At(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f);
+    r = At(static_cast<float>(x) + 0.5f + shift_m_, static_cast<float>(y) + 0.5f);
     footprint_m = 1;
-    return true;
+    return !Hole(r.position);
   }
+  bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override {
+    place.receiver = At(probe.origin.x, probe.origin.y);
+    place.footprint_m = 1;
+    place.x_px = probe.origin.x - shift_m_;
+    place.y_px = probe.origin.y;
+    const float t = probe.origin.z - place.receiver.position.z;
+    return probe.direction.z < 0 && t >= 0 && t <= probe.length_m && !Hole(place.receiver.position);
+  }
+  static bool Hole(const Vec3f& p) { return p.x >= 20 && p.x < 23 && p.y < 30; }
   static Receiver At(float x, float y) {
     Receiver r;
     r.position = {x, y, x < 40 ? 0.0f : 30.0f};
@@ -41,6 +51,9 @@ class Floor final : public RecordSource {
     g.harmonic_distance_m = key % 3 == 0 ? 40.0f : 200.0f;
     return g;
   }
+
+ private:
+  const float shift_m_;
 };
 
 const PixelRect kFrame{0, 0, 100, 75};
@@ -79,6 +92,90 @@ TEST(ReceiverHierarchy, RecordsDoNotDependOnTilesThreadsOrEarlierCalls) {
       }
     }
   }
+}
+
+// A camera that moves by parts of a pixel finds nearly all places again, and the same rays from
+// them (what the floor shows depends on the key).
+TEST(ReceiverHierarchy, PlacesStayWhenTheCameraMoves) {
+  Executor executor(2);
+  ReceiverHierarchy::Counts counts;
+  std::set<std::tuple<float, float, float>> before;
+  size_t found = 0, all = 0;
+  for (const float shift : {0.0f, 1.3f, 2.7f}) {
+    const Floor floor(shift);
+    const ReceiverHierarchy hierarchy({}, kFrame, floor);
+    const auto view = hierarchy.Prepare(kFrame, executor, {}, counts);
+    std::vector<const ScreenRecord*> records;
+    view->Collect(kFrame, records);
+    std::set<std::tuple<float, float, float>> now;
+    for (const ScreenRecord* r : records) {
+      const bool inside = r->x_px > 24 && r->x_px < 76;  // what all three see
+      if (!inside || r->screen_reach_px <= kLeastScreenReach) continue;
+      now.insert({r->gather.position.x, r->gather.position.y, r->gather.harmonic_distance_m});
+      found +=
+          before.count({r->gather.position.x, r->gather.position.y, r->gather.harmonic_distance_m});
+      all += !before.empty();
+    }
+    before = now;
+  }
+  EXPECT_GT(all, 40u);
+  EXPECT_GT(static_cast<double>(found), 0.8 * static_cast<double>(all));
+}
+
+// Light that changes where no record's distances tell: only their disagreement does.
+TEST(ReceiverHierarchy, RecordsThatDisagreeAskForMore) {
+  class Patches final : public PlaceSource {
+   public:
+    bool ReceiverAt(int x, int y, Receiver& r, float& footprint_m) const override {
+      return floor_.ReceiverAt(x, y, r, footprint_m);
+    }
+    bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override {
+      return floor_.ReceiverAlong(probe, place);
+    }
+    static float Irradiance(const Vec3f& p) { return p.y < 37 ? 1.0f : 3.0f; }
+    GatherRecord Gather(const Receiver& r, const HemisphereGrid& grid,
+                        uint64_t key) const override {
+      GatherRecord g = floor_.Gather(r, grid, key);
+      g.gradient = {};
+      g.irradiance = Rgb(1, 1, 1) * Irradiance(r.position);
+      return g;
+    }
+
+   private:
+    Floor floor_;
+  };
+  const Patches patches;
+  Executor executor(2);
+  const auto error = [&](float spread, uint64_t& made) {
+    HierarchyParams params;
+    params.spread_wm2 = spread;
+    const ReceiverHierarchy hierarchy(params, kFrame, patches);
+    ReceiverHierarchy::Counts counts;
+    const auto view = hierarchy.Prepare(kFrame, executor, {}, counts);
+    made = counts.records;
+    double sum = 0;
+    for (int y = 0; y < kFrame.y1; ++y) {
+      for (int x = 50; x < kFrame.x1; ++x) {
+        Receiver r;
+        float footprint, weight;
+        if (!patches.ReceiverAt(x, y, r, footprint)) continue;
+        std::vector<const ScreenRecord*> records;
+        view->Collect({x, y, x + 1, y + 1}, records);
+        const ServedReceiver served{&r, static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f};
+        Rgb e;
+        BlendRecords(records, {&served, 1}, {&e, 1}, {&weight, 1});
+        const double d = static_cast<double>(e.x - Patches::Irradiance(r.position));
+        sum += d * d;
+      }
+    }
+    return sum;
+  };
+  uint64_t few, many;
+  const double coarse = error(0, few), fine = error(0.2f, many);
+  EXPECT_GT(coarse, 0);
+  EXPECT_LT(fine, 0.35 * coarse);
+  EXPECT_GT(many, few);
+  EXPECT_LT(many, 5000u);  // where it changes, not everywhere: there are 7,410 pixels
 }
 
 TEST(ReceiverHierarchy, EveryPixelIsServedAndALinearFieldIsReproduced) {
@@ -147,7 +244,7 @@ TEST(ReceiverHierarchy, BlendingEqualsTheLiteralSumWhateverItsCompany) {
   std::vector<float> weight(8);
   int weighed = 0;
   std::vector<std::array<float, 8>> shares(list.size());
-  BlendRecords(list, served, e, weight, shares);
+  BlendRecords(list, served, e, weight, {}, shares);
   for (size_t i = 0; i < 8; ++i) {
     Vec3d sum;
     double weights = 0, finest = 0, scale = 0;
@@ -315,13 +412,14 @@ TEST(ReceiverHierarchy, StopsWhenItIsTold) {
 
 // A camera on a surface sees it at depth 0: no footprint, no reach, and still a record.
 TEST(ReceiverHierarchy, ARecordWithoutReachServesItsOwnReceiver) {
-  class Point final : public RecordSource {
+  class Point final : public PlaceSource {
    public:
     bool ReceiverAt(int, int, Receiver& r, float& footprint_m) const override {
       r.normal = r.geometric_normal = {0, 0, 1};
       footprint_m = 0;
       return true;
     }
+    bool ReceiverAlong(const CellProbe&, ReceiverPlace&) const override { return false; }
     GatherRecord Gather(const Receiver& r, const HemisphereGrid&, uint64_t) const override {
       GatherRecord g;
       g.normal = r.normal;

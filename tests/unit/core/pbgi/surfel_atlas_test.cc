@@ -22,6 +22,10 @@ std::shared_ptr<const PreparedScene> Plane() {
   return PreparedScene::Prepare(scene, executor).value();
 }
 
+std::shared_ptr<const RayAccel> Accel(std::shared_ptr<const PreparedScene> scene) {
+  return RayAccel::Build(std::move(scene)).value();
+}
+
 Rgb Pattern(const Vec3f& p) { return {1 + 0.2f * p.x, 0.5f + 0.1f * p.y, 0.01f}; }
 
 TestCloud Cloud(const Vec3f& origin) {
@@ -104,8 +108,8 @@ TEST(SurfelGrid, AnEmptyTreeHasNothing) {
   const auto tree = TestCloud().Build();
   const SurfelGrid grid(*tree);
   EXPECT_FALSE(grid.Find({0, 0, 0}, {0, 0, 1}, true).has_value());
-  const auto scene = Plane();
-  EXPECT_FALSE(SurfelAtlas(*scene, *tree).Radiance(0, 0.3f, 0.3f, true).has_value());
+  const auto accel = Accel(Plane());
+  EXPECT_FALSE(SurfelAtlas(*accel, *tree).Radiance(0, 0.3f, 0.3f, true).has_value());
 }
 
 // What stands on a surface hides the surfels under it, and they are dark: beside it they must not
@@ -135,7 +139,8 @@ TEST(SurfelAtlas, EveryPointReadsASurfelNearItOnItsSide) {
   const auto scene = Plane();
   const Vec3f origin(scene->origin());
   const auto tree = Cloud(origin).Build();
-  const SurfelAtlas atlas(*scene, *tree);
+  const auto accel = Accel(scene);
+  const SurfelAtlas atlas(*accel, *tree);
   EXPECT_NEAR(atlas.spacing_m(), 0.1f, 1e-3f);
   for (int pass = 0; pass < 2; ++pass) {  // resolved, then read again
     for (int i = 0; i <= 60; ++i) {
@@ -161,7 +166,8 @@ TEST(SurfelAtlas, TexelsTileTheTriangle) {
   const auto scene = Plane();
   const Vec3f origin(scene->origin());
   const auto tree = Cloud(origin).Build();
-  const SurfelAtlas atlas(*scene, *tree);
+  const auto accel = Accel(scene);
+  const SurfelAtlas atlas(*accel, *tree);
   // The mean over the triangle is the pattern's mean: no texel is read for too large a part.
   Vec3d sum, expected;
   const int n = 20000;
@@ -174,8 +180,59 @@ TEST(SurfelAtlas, TexelsTileTheTriangle) {
   EXPECT_NEAR(sum.y / expected.y, 1, 5e-3);
 }
 
+// A wall stands on the plane, lit surfels up to it on one side and none on the other: what is read
+// on the dark side is nothing, also where a texel reaches under the wall.
+TEST(SurfelAtlas, ReadsNothingThroughAWall) {
+  for (const bool wall : {false, true}) {
+    Scene scene;
+    Mesh mesh;
+    mesh.positions = {{-2, -2, 0}, {2, -2, 0}, {2, 2, 0}, {-2, 2, 0}};
+    mesh.triangles = {{0, 1, 2}, {0, 2, 3}};
+    scene.meshes.push_back(mesh);
+    mesh.positions = {{0.03f, -2, -1}, {0.03f, 2, -1}, {0.03f, 2, 1}, {0.03f, -2, 1}};
+    scene.meshes.push_back(mesh);
+    scene.instances.push_back({});
+    if (wall) scene.instances.push_back({.mesh = 1});
+    Executor executor(1);
+    const auto prepared = PreparedScene::Prepare(scene, executor).value();
+    const Vec3f origin(prepared->origin());
+    TestCloud t;
+    for (int j = 0; j < 40; ++j) {
+      for (int i = 0; i < 20; ++i) {
+        const Vec3f p(-1.95f + 0.1f * static_cast<float>(i), -1.95f + 0.1f * static_cast<float>(j),
+                      0);
+        t.Add(p - origin, {0, 0, 1}, 0.01f, Rgb(1, 1, 1), Rgb(1, 1, 1));
+      }
+    }
+    const auto tree = t.Build();
+    const auto accel = Accel(prepared);
+    const SurfelAtlas atlas(*accel, *tree);
+    int lit = 0, through = 0;
+    for (int i = 0; i <= 200; ++i) {
+      for (int j = 0; i + j <= 200; ++j) {
+        const float b1 = static_cast<float>(i) / 200, b2 = static_cast<float>(j) / 200;
+        for (const uint32_t triangle : {0u, 1u}) {
+          const Vec3f p = prepared->PointOn(triangle, b1, b2) + origin;
+          for (const bool front : {true, false}) {
+            const bool read = atlas.Radiance(triangle, b1, b2, front).has_value();
+            lit += read && p.x < -0.2f;
+            through += read && p.x > 0.035f;
+          }
+        }
+      }
+    }
+    EXPECT_GT(lit, 30000) << wall;
+    if (wall) {
+      EXPECT_EQ(through, 0);
+    } else {
+      EXPECT_GT(through, 100);  // or the test would show nothing
+    }
+  }
+}
+
 TEST(SurfelAtlas, KeepsRadianceOfAnyBrightness) {
   const auto scene = Plane();
+  const auto accel = Accel(scene);
   const Vec3f origin(scene->origin());
   for (const float scale : {1e-30f, 1e-6f, 1.0f, 1e6f, 1e30f}) {
     TestCloud t;
@@ -186,12 +243,12 @@ TEST(SurfelAtlas, KeepsRadianceOfAnyBrightness) {
             {0, 0, 1}, 0.01f, Rgb(1, 0.5f, 0) * scale);
     }
     const auto tree = t.Build();
-    const auto got = SurfelAtlas(*scene, *tree).Radiance(0, 0.2f, 0.3f, true);
+    const auto got = SurfelAtlas(*accel, *tree).Radiance(0, 0.2f, 0.3f, true);
     ASSERT_TRUE(got.has_value());
     EXPECT_NEAR(got->x / scale, 1, 2e-5);
     EXPECT_NEAR(got->y / scale, 0.5, 2e-5);
     EXPECT_EQ(got->z, 0);
-    EXPECT_EQ(SurfelAtlas(*scene, *tree).Radiance(0, 0.2f, 0.3f, false), Rgb());
+    EXPECT_EQ(SurfelAtlas(*accel, *tree).Radiance(0, 0.2f, 0.3f, false), Rgb());
   }
 }
 
