@@ -369,7 +369,7 @@ constexpr RenderFlag kRenderFlags[] = {
      }},
     {"--light-samples", "N", kMethod,
      "shadow rays per receiver, 1..4096; default 32: N for all emitters, N for the sky or map, one "
-     "per point or spot light up to max(N, 8) of them, N drawn among more; up to 4 N where some "
+     "per point or spot light up to max(N, 8) of them, N drawn among more; up to 16 N where some "
      "rays to emitters or sky are blocked and others are not; a surfel takes a quarter of N on "
      "each "
      "side",

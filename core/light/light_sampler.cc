@@ -395,12 +395,13 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
 
 Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
                              uint64_t key, uint32_t first_index, unsigned dimension,
-                             LightCounters& counters, bool refine) const {
+                             LightCounters& counters, bool refine, bool environment) const {
   const Query q{p, ng, n, accel_->LeaveSurface(p, ng), samples, key, first_index, dimension};
   Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
     irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
   }
+  if (!environment) return irradiance;
   if (environment_ != nullptr) {
     irradiance += Refined(&LightSampler::FromMap, q, refine, counters);
   } else if (has_sky_) {

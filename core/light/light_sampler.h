@@ -72,11 +72,12 @@ class LightSampler {
   // each takes kRefined times as many where some rays of the *other* half are blocked and others
   // are not. What decides is independent of what it decides about, so this too is unbiased. Not
   // below kFewestRefined samples. Index ranges of one key are then sets of their own.
+  // `environment`: false: without what comes from there.
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
                  uint32_t first_index, unsigned dimension, LightCounters& counters,
-                 bool refine = false) const;
+                 bool refine = false, bool environment = true) const;
 
-  static constexpr uint32_t kRefined = 4, kFewestRefined = 4;
+  static constexpr uint32_t kRefined = 16, kFewestRefined = 4;
 
   // Irradiance(p, ng, n, 1, key, index, dimension, counters) of each active lane, to the same bits,
   // in less than half the time without rays; 0 in the others. `irradiance` is as long as `points`.

@@ -127,8 +127,8 @@ void HemisphereGrid::Centres(float* x, float* y, float* z) const {
 }
 
 HemisphereSamples::HemisphereSamples(const HemisphereGrid& grid)
-    : storage_(size_t{7} * grid.padded(), 0.0f) {
-  for (int i = 0; i < 7; ++i) values_[i] = storage_.data() + size_t(i) * grid.padded();
+    : storage_(size_t{8} * grid.padded(), 0.0f) {
+  for (int i = 0; i < 8; ++i) values_[i] = storage_.data() + size_t(i) * grid.padded();
 }
 
 Rgb IrradianceAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n) {
@@ -148,16 +148,16 @@ struct RecordMaker {
                            const Vec3f& position, const Frame& frame) {
     const uint32_t rings = grid.rings_, sectors = grid.sectors_, stride = grid.stride_;
     const F8 zero = Set8(0.0f), one = Set8(1.0f);
-    F8 sum[3] = {zero, zero, zero}, inverse = zero, seen = zero;
-    F8 vector[3][3];  // by channel and local axis
+    F8 sum[4] = {zero, zero, zero, zero}, inverse = zero, seen = zero;
+    F8 vector[4][3];  // by channel and local axis
     for (auto& channel : vector) channel[0] = channel[1] = channel[2] = zero;
-    F8 along_t[3] = {zero, zero, zero}, along_b[3] = {zero, zero, zero};  // ∇E, local x and y
+    F8 along_t[4] = {zero, zero, zero, zero}, along_b[4] = {zero, zero, zero, zero};  // ∇E
     // A row of neighbours in the ring: the sample of the sector before.
-    AlignedVector<float> before(size_t{4} * stride);
+    AlignedVector<float> before(size_t{5} * stride);
     for (uint32_t j = 0; j < rings; ++j) {
       const size_t row = size_t{j} * stride;
-      for (int c = 0; c < 4; ++c) {
-        const float* values = c < 3 ? samples.radiance(c) : samples.inverse_distance();
+      for (int c = 0; c < 5; ++c) {
+        const float* values = c < 4 ? samples.radiance(c) : samples.inverse_distance();
         float* shifted = before.data() + size_t(c) * stride;
         shifted[0] = values[row + sectors - 1];
         std::copy_n(values + row, sectors - 1, shifted + 1);
@@ -179,7 +179,7 @@ struct RecordMaker {
         inverse += Select8(valid, d, zero);
         seen += Select8(valid, one, zero);
         const F8 inverse_cosine = one / Max8(z, Set8(kLeastCosine));
-        const F8 d_before = Load8(before.data() + size_t{3} * stride + k);
+        const F8 d_before = Load8(before.data() + size_t{4} * stride + k);
         const F8 beside =
             Select8((d >= zero) & (d_before >= zero), Max8(d, d_before), zero) * sideways_weight;
         F8 inward = zero;
@@ -190,7 +190,7 @@ struct RecordMaker {
         }
         const F8 cm = Load8(grid.cos_middle_.data() + k), sm = Load8(grid.sin_middle_.data() + k);
         const F8 cb = Load8(grid.cos_border_.data() + k), sb = Load8(grid.sin_border_.data() + k);
-        for (int c = 0; c < 3; ++c) {
+        for (int c = 0; c < 4; ++c) {
           const F8 l = Load8(samples.radiance(c) + at);
           sum[c] += l;
           const F8 weighted = l * inverse_cosine;
@@ -215,11 +215,13 @@ struct RecordMaker {
     const float inverse_sum = Sum8(inverse);
     record.harmonic_distance_m =
         inverse_sum > 0.0f ? Sum8(seen) / inverse_sum : std::numeric_limits<float>::infinity();
-    for (int c = 0; c < 3; ++c) {
-      record.irradiance[c] = Sum8(sum[c]) * each;
-      record.gradient[c] = frame.t * Sum8(along_t[c]) + frame.b * Sum8(along_b[c]);
-      record.vector[c] =
+    for (int c = 0; c < 4; ++c) {
+      const Vec3f gradient = frame.t * Sum8(along_t[c]) + frame.b * Sum8(along_b[c]);
+      const Vec3f v =
           frame.ToWorld(Vec3f(Sum8(vector[c][0]), Sum8(vector[c][1]), Sum8(vector[c][2])) * each);
+      (c < 3 ? record.irradiance[c] : record.openness) = Sum8(sum[c]) * each;
+      (c < 3 ? record.gradient[static_cast<size_t>(c)] : record.open_gradient) = gradient;
+      (c < 3 ? record.vector[static_cast<size_t>(c)] : record.open_vector) = v;
     }
     return record;
   }
@@ -238,10 +240,8 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
   const uint32_t rings = grid.rings(), sectors = grid.sectors();
   const double each = kPi / grid.size();
   const auto index = [&](uint32_t j, uint32_t k) { return size_t{j} * grid.stride() + k; };
-  const auto radiance = [&](size_t at) {
-    return Vec3d(static_cast<double>(samples.radiance(0)[at]),
-                 static_cast<double>(samples.radiance(1)[at]),
-                 static_cast<double>(samples.radiance(2)[at]));
+  const auto radiance = [&](size_t at, int c) {
+    return static_cast<double>(samples.radiance(c)[at]);
   };
   // 1 / the distance of the nearer one of two; 0 if one was not seen.
   const auto nearer = [&](size_t a, size_t b) {
@@ -249,25 +249,24 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
     const double y = static_cast<double>(samples.inverse_distance()[b]);
     return x < 0 || y < 0 ? 0.0 : std::max(x, y);
   };
-  Vec3d sum;
+  std::array<double, 4> sum = {};
   double inverse = 0;
   uint32_t seen = 0;
-  std::array<Vec3d, 3> vector, gradient;
+  std::array<Vec3d, 4> vector, gradient;
   for (uint32_t j = 0; j < rings; ++j) {
     for (uint32_t k = 0; k < sectors; ++k) {
       const size_t at = index(j, k);
-      const Vec3d l = radiance(at);
       if (samples.inverse_distance()[at] >= 0) {
         ++seen;
         inverse += static_cast<double>(samples.inverse_distance()[at]);
       }
-      sum += l;
       const Vec3f local(samples.direction(0)[at], samples.direction(1)[at],
                         samples.direction(2)[at]);
       const double cosine =
           std::max(static_cast<double>(kLeastCosine), static_cast<double>(local.z));
-      for (int c = 0; c < 3; ++c) {
-        vector[c] += Vec3d(frame.ToWorld(local)) * (l[c] * each / cosine);
+      for (int c = 0; c < 4; ++c) {
+        sum[c] += radiance(at, c);
+        vector[c] += Vec3d(frame.ToWorld(local)) * (radiance(at, c) * each / cosine);
       }
 
       const double sin2 = static_cast<double>(j) / rings;
@@ -275,21 +274,22 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
       const SinCos border = DetSinCos(2 * kPi * k / sectors);
       const Vec3d outward = Vec3d(frame.t) * middle.cos + Vec3d(frame.b) * middle.sin;
       const Vec3d sideways = Vec3d(frame.b) * border.cos - Vec3d(frame.t) * border.sin;
-      Vec3d across_ring, across_sector;
-      if (j > 0) {
-        const size_t inner = index(j - 1, k);
-        across_ring = (l - radiance(inner)) *
-                      (std::sqrt(sin2) * (1 - sin2) * 2 * kPi / sectors * nearer(at, inner));
-      }
+      const size_t inner = j > 0 ? index(j - 1, k) : at;
       const size_t beside = index(j, k == 0 ? sectors - 1 : k - 1);
-      across_sector = (l - radiance(beside)) *
-                      ((std::sqrt((j + 1.0) / rings) - std::sqrt(sin2)) * nearer(at, beside));
-      for (int c = 0; c < 3; ++c) {
-        gradient[c] += outward * across_ring[c] + sideways * across_sector[c];
+      const double ring_weight =
+          std::sqrt(sin2) * (1 - sin2) * 2 * kPi / sectors * nearer(at, inner);
+      const double sector_weight =
+          (std::sqrt((j + 1.0) / rings) - std::sqrt(sin2)) * nearer(at, beside);
+      for (int c = 0; c < 4; ++c) {
+        gradient[c] += outward * ((radiance(at, c) - radiance(inner, c)) * ring_weight) +
+                       sideways * ((radiance(at, c) - radiance(beside, c)) * sector_weight);
       }
     }
   }
-  record.irradiance = Rgb(sum * each);
+  record.irradiance = Rgb(Vec3d(sum[0], sum[1], sum[2]) * each);
+  record.openness = static_cast<float>(sum[3] * each);
+  record.open_gradient = Vec3f(gradient[3]);
+  record.open_vector = Vec3f(vector[3]);
   record.harmonic_distance_m =
       inverse > 0 ? static_cast<float>(seen / inverse) : std::numeric_limits<float>::infinity();
   for (int c = 0; c < 3; ++c) {

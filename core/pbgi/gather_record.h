@@ -63,16 +63,17 @@ class HemisphereSamples {
 
   float* direction(int axis) { return values_[axis]; }  // unit, local frame (z: the normal)
   const float* direction(int axis) const { return values_[axis]; }
-  float* radiance(int channel) { return values_[3 + channel]; }  // W/(m² sr)
+  // W/(m² sr); channel 3: the part through which nothing is hit, [0, 1], or 0 if nobody asked.
+  float* radiance(int channel) { return values_[3 + channel]; }
   const float* radiance(int channel) const { return values_[3 + channel]; }
   // 1/m, the mean where a stratum has several; 0: nothing there; negative: not seen, since it lies
   // below the surface (radiance 0).
-  float* inverse_distance() { return values_[6]; }
-  const float* inverse_distance() const { return values_[6]; }
+  float* inverse_distance() { return values_[7]; }
+  const float* inverse_distance() const { return values_[7]; }
 
  private:
   AlignedVector<float> storage_;
-  float* values_[7];
+  float* values_[8];
 };
 
 struct GatherRecord {
@@ -81,6 +82,10 @@ struct GatherRecord {
   Rgb irradiance;                 // W/m²
   std::array<Vec3f, 3> gradient;  // of each channel, W/m³, in the tangent plane, world
   std::array<Vec3f, 3> vector;    // V of each channel, W/m², world
+  // ∫ V cosθ dω, V: nothing is hit, in [0, π]: what a sky of radiance 1 gives; with its gradient
+  // and vector.
+  float openness = 0;
+  Vec3f open_gradient, open_vector;
   float harmonic_distance_m = 0;  // harmonic mean of the distances; +inf: nothing seen
   float reach_m = 0;              // world radius of influence; set by the caller
 };

@@ -39,8 +39,8 @@ struct alignas(32) Lanes {
 
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight, std::span<float> spread,
-                  std::span<std::array<float, 8>> shares) {
+                  std::span<float> weight, std::span<BlendSpread> spread,
+                  std::span<std::array<float, 8>> shares, std::span<float> openness) {
   Lanes lanes;
   const size_t count = receivers.size();
   for (size_t i = 0; i < 8; ++i) {
@@ -106,6 +106,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
   }
   finest = Select8(left > zero, finest, zero);
   F8 sum[3] = {zero, zero, zero}, weights = zero, grey = zero, squares = zero;
+  F8 open = zero, open_squares = zero;
   for (const Term& term : terms) {
     const GatherRecord& g = records[term.record]->gather;
     F8 w = term.rest - term.away * Max8(Set8(1.0f / g.reach_m), finest);
@@ -134,14 +135,29 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     }
     grey += w * own;
     squares += w * own * own;
+    if (!openness.empty()) {
+      const F8 low = Set8(-0.5f * g.openness), high = Set8(g.openness);
+      const F8 moved = dx * Set8(g.open_gradient.x) + dy * Set8(g.open_gradient.y) +
+                       dz * Set8(g.open_gradient.z);
+      const F8 turn =
+          tx * Set8(g.open_vector.x) + ty * Set8(g.open_vector.y) + tz * Set8(g.open_vector.z);
+      const F8 at = Set8(g.openness) + Min8(Max8(moved, low), high) + Min8(Max8(turn, low), high);
+      const F8 bounded = Min8(Max8(at, zero), Set8(kPif));
+      open += w * bounded;
+      open_squares += w * bounded * bounded;
+    }
   }
   for (size_t i = 0; i < count; ++i) {
     weight[i] = left[i] > 0.0f ? weights[i] : 0.0f;
     const float inverse = weights[i] > 0.0f ? 1.0f / weights[i] : 0.0f;
     irradiance[i] = Rgb(sum[0][i], sum[1][i], sum[2][i]) * inverse;
+    if (!openness.empty()) openness[i] = open[i] * inverse;
     if (!spread.empty()) {
-      const float m = grey[i] * inverse;
-      spread[i] = std::sqrt(std::max(0.0f, squares[i] * inverse - m * m)) / 3;
+      const auto deviation = [&](float sum_of, float squares_of) {
+        const float m = sum_of * inverse;
+        return std::sqrt(std::max(0.0f, squares_of * inverse - m * m));
+      };
+      spread[i] = {deviation(grey[i], squares[i]) / 3, deviation(open[i], open_squares[i])};
     }
   }
 }
@@ -289,10 +305,13 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
         view->Collect({x, y, x + 1, y + 1}, near);
         const ServedReceiver served{&place.receiver, place.x_px, place.y_px};
         Rgb irradiance;
-        float weight, spread = 0;
-        BlendRecords(near, {&served, 1}, {&irradiance, 1}, {&weight, 1}, {&spread, 1});
-        item.chosen =
-            !(weight >= params_.enough) || (params_.spread_wm2 > 0 && spread > params_.spread_wm2);
+        float weight, openness;
+        BlendSpread spread;
+        BlendRecords(near, {&served, 1}, {&irradiance, 1}, {&weight, 1}, {&spread, 1}, {},
+                     {&openness, size_t{params_.spread_open > 0}});
+        const auto above = [](float value, float most) { return most > 0 && value > most; };
+        item.chosen = !(weight >= params_.enough) || above(spread.irradiance, params_.spread_wm2) ||
+                      above(spread.openness, params_.spread_open);
         item.decided = !item.chosen && level.anchored;
         for (const ScreenRecord* r : near) {
           item.most_reach_m =
@@ -393,6 +412,9 @@ void ReceiverHierarchy::SetReach(float footprint_m, float most_reach_m,
     const float slope = Length(g.gradient[c]);
     if (slope > 0.0f) reach = std::min(reach, 0.5f * g.irradiance[c] / slope);
   }
+  if (const float slope = Length(g.open_gradient); slope > 0.0f) {
+    reach = std::min(reach, 0.5f * g.openness / slope);
+  }
   reach = std::min(reach, most_reach_m);
   // Where something is nearer than the floor, a floor that high would carry the dark of a crevice
   // out of it.
@@ -401,6 +423,7 @@ void ReceiverHierarchy::SetReach(float footprint_m, float most_reach_m,
   if (!(reach >= floor)) {
     const float scale = floor > 0.0f ? std::max(reach, 0.0f) / floor : 0.0f;
     for (Vec3f& slope : g.gradient) slope *= scale;
+    g.open_gradient *= scale;
     reach = floor;
   }
   g.reach_m = std::max(reach, std::numeric_limits<float>::min());  // of a camera on a surface

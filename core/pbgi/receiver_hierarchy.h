@@ -7,13 +7,12 @@
 // the square's coordinates, propose the world cells (core/pbgi/world_cell.h) that they lie in, of a
 // side of about s_l pixels' footprints. A cell's place is its active receiver, and a record is
 // gathered there, where the records of coarser levels weigh less than `enough` in sum or disagree
-// by more than `spread_wm2`. So a camera that moves finds the same places, and the same rays from
-// them, again. A place counts if a candidate within kMostShift s_l pixels proposes it. The pixels
-// themselves follow, twice: the second time the records of the first tell of what is near. Every
-// receiver at a pixel's centre is served.
-// A record of level l weighs only within ρ = max(kScreenReach s_l, kLeastScreenReach) pixels, so
-// what a record is depends on the scene, the frame's camera and coarser records near it: never on
-// tiles, threads or order.
+// by more than `spread_wm2` or `spread_open`. So a camera that moves finds the same places, and the
+// same rays from them, again. A place counts if a candidate within kMostShift s_l pixels proposes
+// it. The pixels themselves follow, twice: the second time the records of the first tell of what is
+// near. Every receiver at a pixel's centre is served. A record of level l weighs only within ρ =
+// max(kScreenReach s_l, kLeastScreenReach) pixels, so what a record is depends on the scene, the
+// frame's camera and coarser records near it: never on tiles, threads or order.
 //
 // The weight of record k at a receiver x with normal n, at point p of the image:
 //   w = max(0, 1 - (|x - c| + |(x - c)·(n + n_c)|) / min(a, b) - sqrt((1 - n·n_c) /
@@ -64,8 +63,9 @@ struct HierarchyParams {
   float enough = 0.25f;  // summed weight that spares a receiver a record of its own
   float floor_px = 3;    // least a, in pixels' footprints, see above
   // Standard deviation among records that spares a receiver a record of its own, W/m², mean of the
-  // channels; 0: any does.
+  // channels, and of openness; 0: any does.
   float spread_wm2 = 0;
+  float spread_open = 0;
   uint64_t seed = 0;
 };
 
@@ -108,14 +108,21 @@ struct ServedReceiver {
   float x_px, y_px;  // in the image
 };
 
+// The weighted standard deviations of what records say at a receiver.
+struct BlendSpread {
+  float irradiance = 0;  // mean of the channels, W/m²
+  float openness = 0;    // 0 unless openness is blended
+};
+
 // Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs (see b
 // for where only b is why). What a receiver gets depends on the records that weigh on it and on
-// their order, not on the other receivers. `spread`: none, or the weighted standard deviation of
-// E(x, n), mean of the channels. `shares`: none, or for each record its w at each receiver.
+// their order, not on the other receivers. `spread`: none, or how far they
+// disagree. `shares`: none, or for each record its w at each receiver.
+// `openness`: none, or the same blend of the records' openness, at most π.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
-                  std::span<float> weight, std::span<float> spread = {},
-                  std::span<std::array<float, 8>> shares = {});
+                  std::span<float> weight, std::span<BlendSpread> spread = {},
+                  std::span<std::array<float, 8>> shares = {}, std::span<float> openness = {});
 
 class ReceiverHierarchy {
  public:

@@ -32,6 +32,8 @@ constexpr float kServed = 0.02f;
 // Standard deviation among the records at a receiver that asks for one more, in parts of the
 // frame's mean irradiance.
 constexpr float kMostSpread = 0.15f;
+// The same of the sky's light, in parts of it and the indirect light: shadows have edges.
+constexpr float kMostOpenSpread = 0.05f;
 
 // Keys of independent random choices.
 enum : uint64_t { kKeyPixel = 1, kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
@@ -79,6 +81,7 @@ struct Sample {
   Rgb direct_e, indirect_e, standard_error;
   float cluster = -1, cut_size = 0;
   float weight = 0, heaviest = 0;  // of the records that serve it, adaptive clusters
+  float openness = 0;              // as they blend it, if the sky's light comes from them
 };
 
 // The parameters of adaptive clusters, measured in docs/decisions/0015-adaptive-clusters.md.
@@ -151,11 +154,18 @@ class Renderer final : public FrameRenderer {
     wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
+    wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
+    // Records see how much of a constant sky is open with the rays that they trace anyway, many
+    // more than a receiver has shadow rays.
+    sky_by_records_ =
+        wants_direct_ && settings_.adaptive() && settings_.fill_in_force() == Fill::kRays &&
+        !scene_.scene->has_environment_map() && MaxComponent(scene_.scene->sky()) > 0.0f &&
+        scene_.tree != nullptr && scene_.tree->lit();
     if (settings_.integrator == Integrator::kFpbgi ||
         settings_.integrator == Integrator::kIrrcache) {
-      gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_);
+      gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_,
+                                                   sky_by_records_);
     }
-    wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
   }
 
   absl::StatusOr<TileOutput> RenderTile(const PixelRect& tile, Executor& executor,
@@ -188,10 +198,19 @@ class Renderer final : public FrameRenderer {
       const double cpu = ProcessCpuSeconds();
       ReceiverHierarchy::Counts counts;
       std::call_once(scaled_, [&] {
-        const float mean = gatherer_->MeanIrradiance(frame_.film.frame(), executor);
+        const RecordGatherer::Means mean = gatherer_->MeanOf(frame_.film.frame(), executor);
         HierarchyParams params = HierarchyOf(settings_);
-        params.spread_wm2 = kMostSpread * mean;
-        gatherer_->Refine(NoiseOf(settings_) * mean);
+        params.spread_wm2 = kMostSpread * mean.irradiance;
+        const float noise = NoiseOf(settings_);
+        RecordGatherer::Means deviation{noise * mean.irradiance, 0};
+        if (sky_by_records_) {
+          // The openness that the sky would need to bring the frame's mean light.
+          const Rgb& sky = scene_.scene->sky();
+          const float all = mean.openness + 3 * mean.irradiance / (sky.x + sky.y + sky.z);
+          params.spread_open = kMostOpenSpread * all;
+          deviation.openness = noise * all;
+        }
+        gatherer_->Refine(deviation);
         hierarchy_ = std::make_unique<ReceiverHierarchy>(params, frame_.film.frame(), *gatherer_);
       });
       view = hierarchy_->Prepare(tile, executor, go_on, counts);
@@ -274,10 +293,11 @@ class Renderer final : public FrameRenderer {
     }
     clock.Charge(Stage::kDirect);
 
-    if (wants_indirect_ && !receivers.empty()) {
+    if ((wants_indirect_ || sky_by_records_) && !receivers.empty()) {
       // A receiver whose albedo is black shows no indirect light; it is gathered only if its
       // irradiance itself was asked for.
-      if (!wants_irradiance_ && !settings_.no_skip) {
+      const bool also_black = wants_irradiance_ || (sky_by_records_ && wants_direct_irradiance_);
+      if (!also_black && !settings_.no_skip) {
         for (size_t r = 0; r < receivers.size(); ++r) {
           if (wanted[r] && !(MaxComponent(samples[sample_of[r]].albedo) > 0.0f)) {
             wanted[r] = 0;
@@ -377,7 +397,7 @@ class Renderer final : public FrameRenderer {
       sample.direct_e = scene_.lights->Irradiance(
           receivers[r].position, receivers[r].geometric_normal, receivers[r].normal, each,
           PixelKey(block, sample_of[r], kKeyDirect), (sample_of[r] % settings_.spp) * each, 0,
-          counters, true);
+          counters, true, !sky_by_records_);
     }
     n.rays += counters.rays;
     n.skipped_shadow += counters.skipped_facing_away;
@@ -406,7 +426,7 @@ class Renderer final : public FrameRenderer {
 
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
-    return settings_.adaptive() && wants_indirect_ &&
+    return settings_.adaptive() && (wants_indirect_ || sky_by_records_) &&
            (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
@@ -503,7 +523,7 @@ class Renderer final : public FrameRenderer {
         const size_t count = std::min<size_t>(8, groups[g].size() - at);
         ServedReceiver served[8];
         Rgb e[8];
-        float weight[8];
+        float weight[8], openness[8];
         for (size_t i = 0; i < count; ++i) {
           const uint32_t r = groups[g][at + i];
           const int pixel = static_cast<int>(sample_of[r] / spp);
@@ -511,11 +531,13 @@ class Renderer final : public FrameRenderer {
                        static_cast<float>(block.y0 + pixel / block.width()) + 0.5f};
         }
         if (wants_cluster_) shares.resize(records.size());
-        BlendRecords(records, {served, count}, {e, count}, {weight, count}, {}, shares);
+        BlendRecords(records, {served, count}, {e, count}, {weight, count}, {}, shares,
+                     {openness, sky_by_records_ ? count : 0});
         for (size_t i = 0; i < count; ++i) {
           Sample& sample = samples[sample_of[groups[g][at + i]]];
           sample.indirect_e = e[i];
           sample.weight = weight[i];
+          if (sky_by_records_) sample.openness = openness[i];
           if (!wants_cluster_) continue;
           for (size_t k = 0; k < records.size(); ++k) {
             const float share = shares[k][i];
@@ -545,7 +567,8 @@ class Renderer final : public FrameRenderer {
       const int x = block.x0 + pixel % block.width(), y = block.y0 + pixel / block.width();
       const ServedReceiver served{&receivers[r], static_cast<float>(x) + 0.5f,
                                   static_cast<float>(y) + 0.5f};
-      BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1});
+      BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1}, {}, {},
+                   {&sample.openness, size_t{sky_by_records_}});
       if (sample.weight >= hierarchy_->params().enough) continue;
       clock.Charge(Stage::kConvolve);
       own.push_back(hierarchy_->MakeOwnRecord(
@@ -554,7 +577,14 @@ class Renderer final : public FrameRenderer {
       clock.Skip();
       own_list.push_back(&own.back());
       sample.indirect_e = own.back().gather.irradiance;
+      if (sky_by_records_) sample.openness = own.back().gather.openness;
       ++n.clusters;
+    }
+    if (sky_by_records_) {
+      for (uint32_t r = 0; r < receivers.size(); ++r) {
+        Sample& sample = samples[sample_of[r]];
+        if (wanted[r]) sample.direct_e += scene_.scene->sky() * sample.openness;
+      }
     }
     stats += gatherer_->TakeStats();
   }
@@ -826,6 +856,7 @@ class Renderer final : public FrameRenderer {
   mutable std::unique_ptr<const IrradianceCache> cache_;  // irrcache
   bool wants_cluster_;
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
+  bool sky_by_records_;  // direct light of a constant sky comes from records
 };
 
 bool IsRotation(const Camera& c) {

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <span>
 
 #include "core/base/clock.h"
 #include "core/math/sampling.h"
@@ -73,20 +74,13 @@ class HitReader {
   const uint64_t light_key_;
 };
 
-// How many more rays each stratum deserves, an array of grid.padded() elements: the standard
-// deviation among its up to eight neighbours times its solid angle, over `least_share`.
-std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSamples& samples,
-                               float least_share) {
+// The standard deviation of `value`, an array of grid.padded() elements, among the up to eight
+// neighbours of each stratum, squared and times `scale`², is added to `squares_out`. The first and
+// the last sector are neighbours.
+void AddVariance(const HemisphereGrid& grid, std::span<const float> value, float scale,
+                 std::span<float> squares_out) {
   const uint32_t rings = grid.rings(), sectors = grid.sectors(), stride = grid.stride();
-  const float scale = kPif / static_cast<float>(grid.size()) / least_share;
-  // Sums of columns of three rings, and of their squares, of the mean of the channels; the first
-  // and the last sector stand again at the other end.
-  std::vector<float> value(grid.padded());
-  for (size_t at = 0; at < value.size(); ++at) {
-    value[at] =
-        (samples.radiance(0)[at] + samples.radiance(1)[at] + samples.radiance(2)[at]) * (1.0f / 3);
-  }
-  std::vector<uint8_t> extra(grid.padded(), 0);
+  // Sums of columns of three rings, and of their squares.
   std::vector<float> sum(sectors + 2), squares(sectors + 2);
   for (uint32_t j = 0; j < rings; ++j) {
     const uint32_t first = j > 0 ? j - 1 : 0, last = std::min(j + 1, rings - 1);
@@ -105,15 +99,53 @@ std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSampl
     const float inverse = 1.0f / static_cast<float>(3 * (last - first + 1) - 1);
     for (uint32_t k = 0; k < sectors; ++k) {
       const size_t at = size_t{j} * stride + k;
-      if (samples.inverse_distance()[at] < 0) continue;
       const float own = value[at];
       const float mean = (sum[k] + sum[k + 1] + sum[k + 2] - own) * inverse;
       const float square = (squares[k] + squares[k + 1] + squares[k + 2] - own * own) * inverse;
-      const float rays = scale * std::sqrt(std::max(0.0f, square - mean * mean));
-      extra[at] = static_cast<uint8_t>(std::min(rays, static_cast<float>(kMostExtraRays)));
+      squares_out[at] += std::max(0.0f, square - mean * mean) * scale * scale;
+    }
+  }
+}
+
+// How many more rays each stratum deserves, an array of grid.padded() elements: the standard
+// deviation of what its neighbours see times its solid angle, over `least_share`.
+std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSamples& samples,
+                               const RecordGatherer::Means& least_share) {
+  const float each = kPif / static_cast<float>(grid.size());
+  std::vector<float> squares(grid.padded(), 0.0f);
+  if (least_share.irradiance > 0) {
+    std::vector<float> grey(grid.padded());
+    for (size_t at = 0; at < grey.size(); ++at) {
+      grey[at] = (samples.radiance(0)[at] + samples.radiance(1)[at] + samples.radiance(2)[at]) *
+                 (1.0f / 3);
+    }
+    AddVariance(grid, grey, each / least_share.irradiance, squares);
+  }
+  if (least_share.openness > 0) {
+    AddVariance(grid, {samples.radiance(3), grid.padded()}, each / least_share.openness, squares);
+  }
+  std::vector<uint8_t> extra(grid.padded(), 0);
+  for (uint32_t j = 0; j < grid.rings(); ++j) {
+    for (uint32_t k = 0; k < grid.sectors(); ++k) {
+      const size_t at = size_t{j} * grid.stride() + k;
+      if (samples.inverse_distance()[at] < 0) continue;
+      extra[at] = static_cast<uint8_t>(
+          std::min(std::sqrt(squares[at]), static_cast<float>(kMostExtraRays)));
     }
   }
   return extra;
+}
+
+// x > 0 or 0, rounded down to a quarter of an octave.
+float RoundToQuarter(double x) {
+  if (!(x > 0)) return 0;
+  int octave;
+  const double mantissa = std::frexp(x, &octave);  // in [1/2, 1)
+  double rounded = 0.5;
+  for (const double step : {0.5946035575013605, 0.7071067811865476, 0.8408964152537145}) {
+    if (mantissa >= step) rounded = step;
+  }
+  return static_cast<float>(std::ldexp(rounded, octave));
 }
 
 }  // namespace
@@ -133,8 +165,13 @@ Receiver ReceiverOfHit(const PreparedScene& scene, const RayHit& hit, const Vec3
 
 RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
                                const RenderSettings& settings, const MicrobufferMap& map,
-                               const CutParams& cut_params)
-    : scene_(scene), rays_(rays), settings_(settings), map_(map), cut_params_(cut_params) {
+                               const CutParams& cut_params, bool sees_sky)
+    : scene_(scene),
+      rays_(rays),
+      settings_(settings),
+      map_(map),
+      cut_params_(cut_params),
+      sees_sky_(sees_sky) {
   if (settings.point_based() && settings.fill_in_force() == Fill::kRays && scene.tree != nullptr &&
       !scene.tree->empty()) {
     atlas_ = &scene.Atlas();
@@ -174,8 +211,8 @@ GatherRecord RecordGatherer::Gather(const Receiver& receiver, const HemisphereGr
                                                  : GatherByRays(receiver, grid, key);
 }
 
-float RecordGatherer::MeanIrradiance(const PixelRect& frame, Executor& executor) const {
-  if (frame.empty()) return 0;
+RecordGatherer::Means RecordGatherer::MeanOf(const PixelRect& frame, Executor& executor) const {
+  if (frame.empty()) return {};
   const int pilots = static_cast<int>(
       std::clamp<int64_t>(frame.area() / kPixelsPerPilot, kLeastPilots, kMostPilots));
   const int side =
@@ -183,8 +220,9 @@ float RecordGatherer::MeanIrradiance(const PixelRect& frame, Executor& executor)
   const int columns = (frame.width() + side - 1) / side;
   const int rows = (frame.height() + side - 1) / side;
   const HemisphereGrid grid(kPilotSamples);
-  std::vector<double> seen(static_cast<size_t>(columns) * static_cast<size_t>(rows), -1.0);
-  executor.ForEach(seen.size(), 1, [&](size_t i) {
+  const size_t count = static_cast<size_t>(columns) * static_cast<size_t>(rows);
+  std::vector<double> seen(count, -1.0), open(count, 0.0);
+  executor.ForEach(count, 1, [&](size_t i) {
     const uint64_t jitter = HashKey(settings_.seed, kKeyPilot, i);
     const auto within = [&](uint64_t random) {
       return static_cast<int>(random % static_cast<uint64_t>(side));
@@ -194,24 +232,21 @@ float RecordGatherer::MeanIrradiance(const PixelRect& frame, Executor& executor)
     Receiver receiver;
     float footprint_m;
     if (!frame.Contains(x, y) || !ReceiverAt(x, y, receiver, footprint_m)) return;
-    const Rgb e = Gather(receiver, grid, HashKey(settings_.seed, kKeyPilotGather, i)).irradiance;
+    const GatherRecord g = Gather(receiver, grid, HashKey(settings_.seed, kKeyPilotGather, i));
+    const Rgb& e = g.irradiance;
     seen[i] = (static_cast<double>(e.x) + static_cast<double>(e.y) + static_cast<double>(e.z)) / 3;
+    open[i] = static_cast<double>(g.openness);
   });
-  double sum = 0;
-  int count = 0;
-  for (const double e : seen) {
-    if (!(e >= 0)) continue;
-    sum += e;
-    ++count;
+  double sum = 0, open_sum = 0;
+  int hits = 0;
+  for (size_t i = 0; i < count; ++i) {
+    if (!(seen[i] >= 0)) continue;
+    sum += seen[i];
+    open_sum += open[i];
+    ++hits;
   }
-  if (!(sum > 0)) return 0;
-  int octave;
-  const double mantissa = std::frexp(sum / count, &octave);  // in [1/2, 1)
-  double rounded = 0.5;
-  for (const double step : {0.5946035575013605, 0.7071067811865476, 0.8408964152537145}) {
-    if (mantissa >= step) rounded = step;
-  }
-  return static_cast<float>(std::ldexp(rounded, octave));
+  if (hits == 0) return {};
+  return {RoundToQuarter(sum / hits), RoundToQuarter(open_sum / hits)};
 }
 
 GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const HemisphereGrid& grid,
@@ -235,10 +270,11 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
       const Rgb radiance =
           reader.Read(w, static_cast<uint32_t>(at), samples.inverse_distance()[at]);
       for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = radiance[c];
+      if (sees_sky_ && samples.inverse_distance()[at] == 0) samples.radiance(3)[at] = 1;
     }
   }
   uint64_t refined = 0;
-  if (least_share_ > 0) {
+  if (least_share_.irradiance > 0 || least_share_.openness > 0) {
     const std::vector<uint8_t> extra = ExtraRays(grid, samples, least_share_);
     alignas(32) float x[kMostExtraRays], y[kMostExtraRays], z[kMostExtraRays];
     for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
@@ -248,17 +284,19 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
         ++refined;
         grid.DirectionsIn(ring, sector, directions_key, 1, extra[at], x, y, z);
         Rgb sum(samples.radiance(0)[at], samples.radiance(1)[at], samples.radiance(2)[at]);
-        float inverse_sum = samples.inverse_distance()[at];
+        float inverse_sum = samples.inverse_distance()[at], open = samples.radiance(3)[at];
         for (uint32_t i = 0; i < extra[at]; ++i) {
           const Vec3f w = frame.ToWorld({x[i], y[i], z[i]});
           if (!(Dot(w, receiver.geometric_normal) > 0.0f)) continue;
           float inverse;
           sum += reader.Read(w, static_cast<uint32_t>((i + 1) * grid.padded() + at), inverse);
           inverse_sum += inverse;
+          if (sees_sky_ && inverse == 0) open += 1;
         }
         const float share = 1.0f / static_cast<float>(extra[at] + 1);
         for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = sum[c] * share;
         samples.inverse_distance()[at] = inverse_sum * share;
+        samples.radiance(3)[at] = open * share;
       }
     }
   }

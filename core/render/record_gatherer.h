@@ -22,18 +22,22 @@ namespace farpoint {
 // for the strata.
 class RecordGatherer final : public PlaceSource {
  public:
-  // All must outlive the gatherer. `settings.fill` decides the way.
+  // All must outlive the gatherer. `settings.fill` decides the way. `sees_sky`: records by rays
+  // tell their openness.
   RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
                  const RenderSettings& settings, const MicrobufferMap& map,
-                 const CutParams& cut_params);
+                 const CutParams& cut_params, bool sees_sky = false);
 
-  // The mean irradiance (of the three channels, W/m²) at a few hundred receivers of `frame`, which
-  // are gathered here, rounded to quarters of an octave so that it is the same in most frames of a
-  // sequence; 0: nothing seen.
-  float MeanIrradiance(const PixelRect& frame, Executor& executor) const;
-  // From now on strata are refined down to this standard deviation, W/m²; 0: none are. Not to be
-  // called while others gather.
-  void Refine(float deviation_wm2) { least_share_ = deviation_wm2; }
+  // What a few hundred receivers of `frame` see, which are gathered here.
+  struct Means {
+    float irradiance = 0;  // of the three channels, W/m²
+    float openness = 0;    // see GatherRecord
+  };
+  // Rounded to quarters of an octave, so that they are the same in most frames of a sequence.
+  Means MeanOf(const PixelRect& frame, Executor& executor) const;
+  // From now on strata are refined down to these standard deviations; 0: not for its sake. Not to
+  // be called while others gather.
+  void Refine(const Means& deviation) { least_share_ = deviation; }
 
   bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
   bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override;
@@ -53,8 +57,9 @@ class RecordGatherer final : public PlaceSource {
   const RenderSettings& settings_;
   const MicrobufferMap& map_;
   const CutParams& cut_params_;
+  const bool sees_sky_;
   const SurfelAtlas* atlas_ = nullptr;  // null: shade every hit
-  float least_share_ = 0;               // of standard deviation, W/m², for a ray more; 0: none
+  Means least_share_;                   // of standard deviation, for a ray more; 0: none
   float near_m_ = 0;                    // hits nearer than this are shaded afresh
   mutable std::mutex mutex_;
   mutable Stats stats_;

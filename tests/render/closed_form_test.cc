@@ -168,5 +168,45 @@ TEST(Sky, IsDirectLightOnly) {
   EXPECT_EQ(r.film.Get(Layer::kBeauty, 3, 16, 28), 1.0f);
 }
 
+// A wall of infinite length hides of the sky what lies below its edge: at distance d from a wall of
+// height h the floor's openness is pi (1 + cos a) / 2, tan a = h / d. Records see it with their own
+// rays, shadow rays (of --clusters N) are on their own: both agree with the closed form, and
+// records err by half as much.
+TEST(Sky, RecordsAndShadowRaysSeeAsMuch) {
+  Scene scene;
+  AddLambert(scene, QuadMesh({-500, 0, 10}, {500, 0, 10}, {500, 0, 0}, {-500, 0, 0}), 0.5f);
+  AddLambert(scene, QuadMesh({-500, 0, 0}, {500, 0, 0}, {500, 2, 0}, {-500, 2, 0}), 0.0f);
+  scene.environment.sky = Rgb(1, 1, 1);
+  const Camera camera = LookAt({0, 8, 3}, {0, 0, 2.9}, {0, 0, -1}, 40);
+  double error[2];
+  for (const bool records : {true, false}) {
+    RenderSettings s;
+    s.points = 4000;
+    s.layers = {Layer::kDirectIrradiance, Layer::kPosition, Layer::kNormal};
+    if (!records) s.clusters = 16;
+    const Rendered r = RenderScene(scene, camera, Whole(96, 96), s);
+    double sum = 0, square = 0;
+    int n = 0;
+    for (int y = 0; y < 96; ++y) {
+      for (int x = 0; x < 96; ++x) {
+        if (r.film.Get(Layer::kNormal, 1, x, y) < 0.5f) continue;
+        const double d = static_cast<double>(r.film.Get(Layer::kPosition, 2, x, y));
+        if (!(d > 0.1)) continue;
+        const double truth = kPi * (1 + d / std::sqrt(d * d + 4)) / 2;
+        const double e =
+            static_cast<double>(r.film.Get(Layer::kDirectIrradiance, 0, x, y)) / truth - 1;
+        sum += e;
+        square += e * e;
+        ++n;
+      }
+    }
+    ASSERT_GT(n, 5000);
+    EXPECT_NEAR(sum / n, 0, 0.006) << records;
+    error[records ? 0 : 1] = std::sqrt(square / n);
+  }
+  EXPECT_LT(error[0], 0.01);
+  EXPECT_LT(error[0], 0.7 * error[1]);
+}
+
 }  // namespace
 }  // namespace farpoint

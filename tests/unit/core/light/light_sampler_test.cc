@@ -1010,7 +1010,7 @@ TEST(LightSampler, RefinesPenumbrasOnly) {
     refined.Add(estimate(0.2, true, key, many));
   }
   EXPECT_GT(many.rays, 3.2 * static_cast<double>(few.rays));
-  EXPECT_LE(many.rays, 4 * few.rays);
+  EXPECT_LE(many.rays, LightSampler::kRefined * few.rays);
   EXPECT_LT(refined.variance(), 0.5 * plain.variance());
 }
 

@@ -121,7 +121,10 @@ TEST(GatherRecord, EqualsTheLiteralSums) {
   for (const uint32_t samples : {1u, 16u, 64u, 250u, 1024u}) {
     const HemisphereGrid grid(samples);
     const Frame frame(Normalize(Vec3f(0.3f, -0.5f, 0.8f)));
-    const HemisphereSamples s = Sample(grid, frame, {}, kRandom, samples);
+    HemisphereSamples s = Sample(grid, frame, {}, kRandom, samples);
+    for (uint32_t at = 0; at < grid.padded(); ++at) {
+      s.radiance(3)[at] = s.radiance(0)[at] > s.radiance(1)[at] ? 1.0f : 0.25f * s.radiance(2)[at];
+    }
     const GatherRecord a = MakeGatherRecord(grid, s, {1, 2, 3}, frame);
     const GatherRecord b = MakeGatherRecordLiteral(grid, s, {1, 2, 3}, frame);
     EXPECT_EQ(a.position, b.position);
@@ -132,6 +135,10 @@ TEST(GatherRecord, EqualsTheLiteralSums) {
       for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.gradient[c][i], b.gradient[c][i], 2e-4) << samples;
       for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.vector[c][i], b.vector[c][i], 2e-4) << samples;
     }
+    EXPECT_GT(b.openness, 0.1f);
+    EXPECT_NEAR(a.openness, b.openness, 1e-5) << samples;
+    for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.open_gradient[i], b.open_gradient[i], 2e-4);
+    for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.open_vector[i], b.open_vector[i], 2e-4);
   }
 }
 

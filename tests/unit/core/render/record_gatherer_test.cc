@@ -73,7 +73,7 @@ class RecordGathererTest : public testing::Test {
 TEST_F(RecordGathererTest, RefiningKeepsTheMeanAndLowersTheVariance) {
   const RecordGatherer plain = MakeGatherer();
   RecordGatherer refined = MakeGatherer();
-  refined.Refine(0.002f * refined.MeanIrradiance(kFilm.frame(), executor_));
+  refined.Refine({0.002f * refined.MeanOf(kFilm.frame(), executor_).irradiance});
   constexpr uint64_t kCount = 600;
   for (const auto& [x, y] : {std::pair{32, 58}, std::pair{8, 30}, std::pair{40, 12}}) {
     const Moments a = MomentsAt(x, y, plain, kCount), b = MomentsAt(x, y, refined, kCount);
@@ -90,13 +90,13 @@ TEST_F(RecordGathererTest, RefiningFollowsTheNoiseThatIsAllowed) {
   double before = 1e9;
   for (const float noise : {0.0005f, 0.002f, 0.01f, 0.1f}) {
     RecordGatherer gatherer = MakeGatherer();
-    gatherer.Refine(noise * gatherer.MeanIrradiance(kFilm.frame(), executor_));
+    gatherer.Refine({noise * gatherer.MeanOf(kFilm.frame(), executor_).irradiance});
     const double rays = MomentsAt(32, 58, gatherer, 20).rays;
     EXPECT_LT(rays, before);
     before = rays;
   }
   RecordGatherer plain = MakeGatherer();
-  plain.Refine(0);
+  plain.Refine({});
   EXPECT_EQ(MomentsAt(32, 58, plain, 20).rays, before);
 }
 
@@ -104,8 +104,8 @@ TEST_F(RecordGathererTest, RefiningFollowsTheNoiseThatIsAllowed) {
 TEST_F(RecordGathererTest, RefiningDoesNotDependOnThreads) {
   RecordGatherer a = MakeGatherer(), b = MakeGatherer();
   Executor one(1);
-  a.Refine(0.003f * a.MeanIrradiance(kFilm.frame(), one));
-  b.Refine(0.003f * b.MeanIrradiance(kFilm.frame(), executor_));
+  a.Refine({0.003f * a.MeanOf(kFilm.frame(), one).irradiance});
+  b.Refine({0.003f * b.MeanOf(kFilm.frame(), executor_).irradiance});
   const Moments ma = MomentsAt(20, 50, a, 5), mb = MomentsAt(20, 50, b, 5);
   EXPECT_EQ(ma.mean, mb.mean);
   EXPECT_EQ(ma.rays, mb.rays);
