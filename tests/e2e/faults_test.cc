@@ -21,7 +21,7 @@ std::vector<std::string> Job(const std::string& output) {
           "--integrator",
           "pt",
           "--paths",
-          "1024",
+          "2048",
           "--tile",
           "32",
           "--points",
@@ -64,6 +64,24 @@ class Faults : public testing::Test {
       return !job.is_null() && job["tiles"]["committed"] >= tiles && job["tiles"]["leased"] >= 1;
     });
   }
+  // Stops the worker so that it holds a tile, whose result is not on its way. It must be continued
+  // or killed before its lease ends.
+  bool StopInMidTile(size_t worker) {
+    return WaitUntil(seconds(60), [&] {
+      const Json before = OnlyJob();
+      if (before.is_null() || before["tiles"]["committed"] < 1) return false;
+      farm_.worker(worker).Signal(SIGSTOP);
+      // What it sent just before is received by the time of the second look.
+      for (int look = 0; look < 2; ++look) {
+        const Json job = OnlyJob();
+        if (job.is_null() || job["tiles"]["leased"] < 1) {
+          farm_.worker(worker).Signal(SIGCONT);
+          return false;
+        }
+      }
+      return true;
+    });
+  }
   void ExpectDone(const std::string& reference) {
     EXPECT_EQ(client_->Wait(seconds(120)), 0) << farm_.Read("client.err") << farm_.Logs();
     EXPECT_EQ(ImageHashOf(farm_.File("a.exr")), reference);
@@ -81,7 +99,7 @@ TEST_F(Faults, AWorkerThatIsKilledInMidTileChangesNothingButTime) {
   const std::string reference = ReferenceHash();
   const size_t victim = farm_.StartWorker();
   Submit();
-  ASSERT_TRUE(WaitForCommitted(1)) << farm_.Logs();
+  ASSERT_TRUE(StopInMidTile(victim)) << farm_.Logs();
   farm_.worker(victim).Signal(SIGKILL);
   EXPECT_EQ(farm_.worker(victim).Wait(seconds(5)), 128 + SIGKILL);
   const Json at_death = OnlyJob();
@@ -95,8 +113,7 @@ TEST_F(Faults, AWorkerThatIsStoppedLosesItsTile) {
   const std::string reference = ReferenceHash();
   const size_t victim = farm_.StartWorker();
   Submit();
-  ASSERT_TRUE(WaitForCommitted(1)) << farm_.Logs();
-  farm_.worker(victim).Signal(SIGSTOP);
+  ASSERT_TRUE(StopInMidTile(victim)) << farm_.Logs();
   farm_.StartWorker();
   ExpectDone(reference);
   // It wakes with a result that nobody waits for, and is of use again.
