@@ -83,7 +83,8 @@ struct GatherRecord {
   std::array<Vec3f, 3> gradient;  // of each channel, W/m³, in the tangent plane, world
   std::array<Vec3f, 3> vector;    // V of each channel, W/m², world
   // ∫ V cosθ dω, V: nothing is hit, in [0, π]: what a sky of radiance 1 gives; with its gradient
-  // and vector.
+  // and vector. Carried like the irradiance, and what a turn reveals is taken to be as open as the
+  // rest: + openness (1 - n · n_c).
   float openness = 0;
   Vec3f open_gradient, open_vector;
   float harmonic_distance_m = 0;  // harmonic mean of the distances; +inf: nothing seen

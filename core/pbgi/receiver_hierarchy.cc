@@ -139,8 +139,11 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
       const F8 low = Set8(-0.5f * g.openness), high = Set8(g.openness);
       const F8 moved = dx * Set8(g.open_gradient.x) + dy * Set8(g.open_gradient.y) +
                        dz * Set8(g.open_gradient.z);
-      const F8 turn =
-          tx * Set8(g.open_vector.x) + ty * Set8(g.open_vector.y) + tz * Set8(g.open_vector.z);
+      // What the turn reveals beyond the record's horizon is as open as the rest: so a sphere under
+      // nothing but sky is as bright everywhere.
+      const F8 cosine = nx * Set8(g.normal.x) + ny * Set8(g.normal.y) + nz * Set8(g.normal.z);
+      const F8 turn = tx * Set8(g.open_vector.x) + ty * Set8(g.open_vector.y) +
+                      tz * Set8(g.open_vector.z) + Set8(g.openness) * (one - cosine);
       const F8 at = Set8(g.openness) + Min8(Max8(moved, low), high) + Min8(Max8(turn, low), high);
       const F8 bounded = Min8(Max8(at, zero), Set8(kPif));
       open += w * bounded;

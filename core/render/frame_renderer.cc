@@ -6,7 +6,9 @@
 #include <chrono>
 #include <cmath>
 #include <mutex>
+#include <numeric>
 #include <optional>
+#include <utility>
 
 #include "core/base/clock.h"
 #include "core/irrcache/irradiance_cache.h"
@@ -156,11 +158,12 @@ class Renderer final : public FrameRenderer {
                       wants(Layer::kCluster);
     wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
     // Records see how much of a constant sky is open with the rays that they trace anyway, many
-    // more than a receiver has shadow rays.
-    sky_by_records_ =
-        wants_direct_ && settings_.adaptive() && settings_.fill_in_force() == Fill::kRays &&
-        !scene_.scene->has_environment_map() && MaxComponent(scene_.scene->sky()) > 0.0f &&
-        scene_.tree != nullptr && scene_.tree->lit();
+    // more than a receiver has shadow rays. Also where nobody asks for direct light: what records
+    // are must not depend on the layers.
+    sky_by_records_ = settings_.adaptive() && settings_.fill_in_force() == Fill::kRays &&
+                      !scene_.scene->has_environment_map() &&
+                      MaxComponent(scene_.scene->sky()) > 0.0f && scene_.tree != nullptr &&
+                      scene_.tree->lit();
     if (settings_.integrator == Integrator::kFpbgi ||
         settings_.integrator == Integrator::kIrrcache) {
       gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_,
@@ -293,7 +296,7 @@ class Renderer final : public FrameRenderer {
     }
     clock.Charge(Stage::kDirect);
 
-    if ((wants_indirect_ || sky_by_records_) && !receivers.empty()) {
+    if ((wants_indirect_ || (wants_direct_ && sky_by_records_)) && !receivers.empty()) {
       // A receiver whose albedo is black shows no indirect light; it is gathered only if its
       // irradiance itself was asked for.
       const bool also_black = wants_irradiance_ || (sky_by_records_ && wants_direct_irradiance_);
@@ -426,7 +429,7 @@ class Renderer final : public FrameRenderer {
 
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
-    return settings_.adaptive() && (wants_indirect_ || sky_by_records_) &&
+    return settings_.adaptive() && (wants_indirect_ || (wants_direct_ && sky_by_records_)) &&
            (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
@@ -465,8 +468,9 @@ class Renderer final : public FrameRenderer {
                    const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
                    Counters& n, Stats& stats, StageClock& clock) const {
     std::vector<GatherRecord> own;
-    for (uint32_t r = 0; r < receivers.size(); ++r) {
-      if (r == 0 || sample_of[r] / settings_.spp != sample_of[r - 1] / settings_.spp) own.clear();
+    uint32_t last_pixel = ~0u;
+    for (const uint32_t r : BlackLast(samples, sample_of)) {
+      if (std::exchange(last_pixel, sample_of[r] / settings_.spp) != last_pixel) own.clear();
       if (!wanted[r]) continue;
       Sample& sample = samples[sample_of[r]];
       const Receiver& receiver = receivers[r];
@@ -486,6 +490,25 @@ class Renderer final : public FrameRenderer {
       sample.indirect_e = e.irradiance;
     }
     stats += gatherer_->TakeStats();
+  }
+
+  // The receivers by pixel, within a pixel those whose albedo is black last: whether they are
+  // gathered depends on what was asked for, so the others must not read what was made for them.
+  std::vector<uint32_t> BlackLast(const std::vector<Sample>& samples,
+                                  const std::vector<uint32_t>& sample_of) const {
+    std::vector<uint32_t> order(sample_of.size());
+    std::iota(order.begin(), order.end(), 0u);
+    for (size_t begin = 0, end; begin < order.size(); begin = end) {
+      for (end = begin; end < order.size() &&
+                        sample_of[end] / settings_.spp == sample_of[begin] / settings_.spp;) {
+        ++end;
+      }
+      std::stable_partition(order.begin() + static_cast<ptrdiff_t>(begin),
+                            order.begin() + static_cast<ptrdiff_t>(end), [&](uint32_t r) {
+                              return MaxComponent(samples[sample_of[r]].albedo) > 0.0f;
+                            });
+    }
+    return order;
   }
 
   // Of the pixel of a record's place, or the nearest within the frame.
@@ -555,8 +578,9 @@ class Renderer final : public FrameRenderer {
     // share what they make.
     std::vector<ScreenRecord> own;
     std::vector<const ScreenRecord*> own_list;
-    for (uint32_t r = 0; r < receivers.size() && spp > 1; ++r) {
-      if (r == 0 || sample_of[r] / spp != sample_of[r - 1] / spp) {
+    uint32_t last_pixel = ~0u;
+    for (const uint32_t r : spp > 1 ? BlackLast(samples, sample_of) : std::vector<uint32_t>()) {
+      if (std::exchange(last_pixel, sample_of[r] / spp) != last_pixel) {
         own.clear();
         own.reserve(spp);
         own_list.clear();

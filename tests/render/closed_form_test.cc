@@ -70,30 +70,32 @@ TEST(Furnace, PointBasedIntegratorsAgreeWithinOnePercent) {
   }
 }
 
+// About the origin, with smooth normals that point outwards.
+Mesh SphereMesh(float radius, int rings, int segments) {
+  Mesh sphere;
+  for (int i = 0; i <= rings; ++i) {
+    for (int j = 0; j < segments; ++j) {
+      const SinCos t = DetSinCos(kPi * i / rings), p = DetSinCos(2 * kPi * j / segments);
+      sphere.normals.push_back({static_cast<float>(t.sin * p.cos), static_cast<float>(t.cos),
+                                static_cast<float>(t.sin * p.sin)});
+      sphere.positions.push_back(sphere.normals.back() * radius);
+    }
+  }
+  const auto at = [&](int i, int j) { return static_cast<uint32_t>(i * segments + j % segments); };
+  for (int i = 0; i < rings; ++i) {
+    for (int j = 0; j < segments; ++j) {
+      if (i > 0) sphere.triangles.push_back({at(i, j), at(i, j + 1), at(i + 1, j)});
+      if (i + 1 < rings) sphere.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
+    }
+  }
+  return sphere;
+}
+
 // A point light at the centre of a sphere of radius R and albedo rho: E_direct = I / R² and, as the
 // form factor between any two points of a sphere is the same, E_indirect = rho I / R².
 TEST(SphereWithLight, IndirectIsRhoTimesDirect) {
   constexpr float kRadius = 2.0f, kRho = 0.5f, kIntensity = 12.0f;
-  Mesh sphere;
-  constexpr int kRings = 96, kSegments = 192;
-  for (int i = 0; i <= kRings; ++i) {
-    for (int j = 0; j < kSegments; ++j) {
-      const SinCos t = DetSinCos(kPi * i / kRings), p = DetSinCos(2 * kPi * j / kSegments);
-      sphere.positions.push_back(Vec3f(static_cast<float>(t.sin * p.cos), static_cast<float>(t.cos),
-                                       static_cast<float>(t.sin * p.sin)) *
-                                 kRadius);
-    }
-  }
-  const auto at = [&](int i, int j) {
-    return static_cast<uint32_t>(i * kSegments + j % kSegments);
-  };
-  for (int i = 0; i < kRings; ++i) {
-    for (int j = 0; j < kSegments; ++j) {
-      if (i > 0) sphere.triangles.push_back({at(i, j), at(i, j + 1), at(i + 1, j)});
-      if (i + 1 < kRings)
-        sphere.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
-    }
-  }
+  const Mesh sphere = SphereMesh(kRadius, 96, 192);
   Scene scene;
   AddLambert(scene, sphere, kRho);
   PunctualLight light;
@@ -206,6 +208,33 @@ TEST(Sky, RecordsAndShadowRaysSeeAsMuch) {
   }
   EXPECT_LT(error[0], 0.01);
   EXPECT_LT(error[0], 0.7 * error[1]);
+}
+
+// Nothing shadows a sphere that is alone under a sky: pi L everywhere, however it is curved.
+TEST(Sky, ASphereIsAsBrightEverywhere) {
+  Scene scene;
+  AddLambert(scene, SphereMesh(1, 24, 48), 0.5f);
+  scene.environment.sky = Rgb(2, 2, 2);
+  RenderSettings s;
+  s.points = 2000;
+  s.layers = {Layer::kDirectIrradiance, Layer::kDepth};
+  const Rendered r =
+      RenderScene(scene, LookAt({0, 0, 4}, {0, 0, 0}, {0, 1, 0}, 40), Whole(64, 64), s);
+  double sum = 0, worst = 0;
+  int n = 0;
+  for (int y = 0; y < 64; ++y) {
+    for (int x = 0; x < 64; ++x) {
+      if (!std::isfinite(r.film.Get(Layer::kDepth, 0, x, y))) continue;
+      const double e =
+          static_cast<double>(r.film.Get(Layer::kDirectIrradiance, 0, x, y)) / (2 * kPi) - 1;
+      sum += e;
+      worst = std::max(worst, std::fabs(e));
+      ++n;
+    }
+  }
+  ASSERT_GT(n, 1000);
+  EXPECT_NEAR(sum / n, 0, 0.005);
+  EXPECT_LT(worst, 0.06);
 }
 
 }  // namespace

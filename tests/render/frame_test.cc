@@ -77,6 +77,51 @@ TEST_P(FrameOf, SkippingChangesNoBit) {
   EXPECT_EQ(ImageHash(RenderScene(scene, scene.cameras[0], Whole(64, 64), s).film), skipped);
 }
 
+// Thin strips, black and white in turn, so that samples of a pixel lie on several.
+Scene Strips() {
+  Scene scene;
+  for (int i = 0; i < 60; ++i) {
+    const float x = 0.05f * static_cast<float>(i) - 1.5f, z = 0.3f * static_cast<float>(i % 3);
+    AddLambert(scene, QuadMesh({x, -1, z}, {x + 0.04f, -1, z}, {x + 0.04f, 1, z}, {x, 1, z}),
+               i % 2 == 0 ? 0.0f : 0.8f);
+  }
+  AddLambert(scene, QuadMesh({-3, -1.2f, 3}, {3, -1.2f, 3}, {3, -1.2f, -3}, {-3, -1.2f, -3}), 0.6f);
+  scene.environment.sky = Rgb(1, 0.8f, 0.6f);
+  scene.cameras = {LookAt({0.3, 0.4, 5}, {0, 0, 0}, {0, 1, 0}, 40)};
+  return scene;
+}
+
+// Nor which layers are asked for, nor skipping, where black samples share a pixel with others.
+TEST_P(FrameOf, LayersAndSkippingChangeNoBitUnderASky) {
+  const Scene scene = Strips();
+  RenderSettings s = Small(GetParam());
+  s.spp = 4;
+  const FilmSpec film = Whole(48, 32);
+  const auto hash = [&](std::vector<Layer> layers, Layer of, bool no_skip) {
+    RenderSettings asked = s;
+    asked.layers = std::move(layers);
+    asked.no_skip = no_skip;
+    const Film all = RenderScene(scene, scene.cameras[0], film, asked).film;
+    Film one(film.crop, {of});
+    for (int y = 0; y < film.height; ++y) {
+      for (int x = 0; x < film.width; ++x) {
+        const float v[4] = {all.Get(of, 0, x, y), all.Get(of, 1, x, y), all.Get(of, 2, x, y), 1};
+        one.Set(of, x, y, std::span(v, of == Layer::kBeauty ? 4 : 3));
+      }
+    }
+    return ImageHash(one);
+  };
+  const Digest beauty = hash({Layer::kBeauty}, Layer::kBeauty, false);
+  EXPECT_EQ(hash({Layer::kBeauty}, Layer::kBeauty, true), beauty);
+  EXPECT_EQ(
+      hash({Layer::kBeauty, Layer::kIrradiance, Layer::kDirectIrradiance}, Layer::kBeauty, false),
+      beauty);
+  EXPECT_EQ(hash({Layer::kIrradiance}, Layer::kIrradiance, false),
+            hash({Layer::kBeauty, Layer::kIrradiance}, Layer::kIrradiance, false));
+  EXPECT_EQ(hash({Layer::kDirect}, Layer::kDirect, false),
+            hash({Layer::kDirect, Layer::kIndirect}, Layer::kDirect, false));
+}
+
 TEST_P(FrameOf, PowerOfTwoScaleKeepsTheBits) {
   Scene scene = MakeCornellBox();
   RenderSettings s = Small(GetParam());
