@@ -172,14 +172,16 @@ absl::StatusOr<uint32_t> Pilot(const PixelTracer& tracer, std::span<const PixelP
   const double needed = noise[1] > options.noise
                             ? kPilotPaths[1] * std::pow(noise[1] / options.noise, 1.0 / slope)
                             : static_cast<double>(options.min_paths);
-  // Of a path for each half. The primary rays of a block are the same for all numbers of paths.
-  const double seconds_per_path =
-      std::max(0.0, seconds[1] - seconds[0]) /
-      (static_cast<double>(few.size()) * (kPilotPaths[1] - kPilotPaths[0]));
-  const double affordable =
-      seconds_per_path > 0
-          ? options.budget_s / (seconds_per_path * static_cast<double>(pixels.size()))
-          : static_cast<double>(kMaxPaths);
+  // Of a path for each half. The primary rays of a block are the same for all numbers of paths;
+  // where the clock does not tell the two pilots apart, they are counted in.
+  const double traced = static_cast<double>(few.size());
+  const double more_s = seconds[1] - seconds[0];
+  const double seconds_per_path = more_s > 0 ? more_s / (traced * (kPilotPaths[1] - kPilotPaths[0]))
+                                             : seconds[1] / (traced * kPilotPaths[1]);
+  double affordable = options.budget_s > 0 ? static_cast<double>(kMaxPaths) : 0.0;
+  if (seconds_per_path > 0) {
+    affordable = options.budget_s / (seconds_per_path * static_cast<double>(pixels.size()));
+  }
   const double most = std::min(affordable, static_cast<double>(kMaxPaths));
   // A power of two keeps Sobol' points balanced: the next above what is needed, unless the budget
   // ends below it.
