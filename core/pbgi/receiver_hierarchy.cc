@@ -218,9 +218,8 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     const int columns = (asked.x1 - 1) / c - x0 + 1, rows = (asked.y1 - 1) / c - y0 + 1;
     struct Candidate {
       WorldCell cell;
-      float x_px = 0, y_px = 0;
+      ReceiverPlace place;
       bool seen = false;
-      ReceiverPlace place;  // of levels that are not anchored
     };
     std::vector<Candidate> candidates(static_cast<size_t>(columns) * static_cast<size_t>(rows));
     executor.ForEachPiece(candidates.size(), 64, [&](size_t begin, size_t end) {
@@ -233,10 +232,10 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
         const int y = static_cast<int>(row * side + (jitter >> 32) % side);
         if (!frame_.Contains(x, y)) continue;
         Candidate& candidate = candidates[i];
-        ReceiverPlace place;
+        ReceiverPlace& place = candidate.place;
         if (!source_.ReceiverAt(x, y, place.receiver, place.footprint_m)) continue;
-        place.x_px = candidate.x_px = static_cast<float>(x) + 0.5f;
-        place.y_px = candidate.y_px = static_cast<float>(y) + 0.5f;
+        place.x_px = static_cast<float>(x) + 0.5f;
+        place.y_px = static_cast<float>(y) + 0.5f;
         candidate.seen = true;
         if (level.anchored) {
           candidate.cell = CellOf(
@@ -244,7 +243,6 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
         } else {
           candidate.cell.i = x;
           candidate.cell.j = y;
-          candidate.place = place;
         }
       }
     });
@@ -292,8 +290,8 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
           const float most = kMostShift * static_cast<float>(s);
           const bool close = std::any_of(candidates.begin() + item.first,
                                          candidates.begin() + item.end, [&](const Candidate& by) {
-                                           const float dx = by.x_px - place.x_px,
-                                                       dy = by.y_px - place.y_px;
+                                           const float dx = by.place.x_px - place.x_px,
+                                                       dy = by.place.y_px - place.y_px;
                                            return dx * dx + dy * dy <= most * most;
                                          });
           if (!close) continue;

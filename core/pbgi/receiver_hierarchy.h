@@ -88,6 +88,7 @@ class RecordSource {
                               uint64_t key) const = 0;
 };
 
+// What the hierarchy needs besides, to put records at places of the scene.
 class PlaceSource : public RecordSource {
  public:
   // The surface that the probe meets first, turned towards where the probe comes from. False: none,
@@ -116,9 +117,9 @@ struct BlendSpread {
 
 // Σ w E(x, n) / Σ w over `records` and Σ w, at 1 to 8 receivers; 0 where no record weighs (see b
 // for where only b is why). What a receiver gets depends on the records that weigh on it and on
-// their order, not on the other receivers. `spread`: none, or how far they
-// disagree. `shares`: none, or for each record its w at each receiver.
-// `openness`: none, or the same blend of the records' openness, at most π.
+// their order, not on the other receivers. `spread`: none, or how far they disagree. `shares`:
+// none, or for each record its w at each receiver. `openness`: none, or the same blend of the
+// records' openness, at most π.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
                   std::span<float> weight, std::span<BlendSpread> spread = {},

@@ -5,7 +5,8 @@
 // (its `face`), within a layer of height h across it. Its place is the point where a probe meets a
 // surface first that crosses the layer (and a quarter of h more on either side) at a point of the
 // square's middle, jittered by the cell's own coordinates. So the place is a function of the cell,
-// the scene and the seed, whoever asks and from wherever; the camera decides through h alone.
+// the scene and the seed; a camera decides which cells are asked for, and how large, and may refuse
+// places that it does not see.
 #pragma once
 
 #include <compare>

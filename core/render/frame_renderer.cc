@@ -296,7 +296,7 @@ class Renderer final : public FrameRenderer {
     }
     clock.Charge(Stage::kDirect);
 
-    if ((wants_indirect_ || (wants_direct_ && sky_by_records_)) && !receivers.empty()) {
+    if (WantsGather() && !receivers.empty()) {
       // A receiver whose albedo is black shows no indirect light; it is gathered only if its
       // irradiance itself was asked for.
       const bool also_black = wants_irradiance_ || (sky_by_records_ && wants_direct_irradiance_);
@@ -427,9 +427,12 @@ class Renderer final : public FrameRenderer {
     n.skipped_shadow += counters.skipped_facing_away;
   }
 
+  // Records may bring direct light, too.
+  bool WantsGather() const { return wants_indirect_ || (wants_direct_ && sky_by_records_); }
+
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
-    return settings_.adaptive() && (wants_indirect_ || (wants_direct_ && sky_by_records_)) &&
+    return settings_.adaptive() && WantsGather() &&
            (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
