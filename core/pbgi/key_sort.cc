@@ -22,13 +22,15 @@ void SortByKey(std::vector<KeyedIndex>& items, Executor& executor) {
                      [](const KeyedIndex& a, const KeyedIndex& b) { return a.key < b.key; });
     return;
   }
-  uint64_t all_or = 0, all_and = ~uint64_t{0};
-  for (const KeyedIndex& item : items) {
-    all_or |= item.key;
-    all_and &= item.key;
-  }
-  const uint64_t differing = all_or & ~all_and;
   const size_t pieces = (n + kPiece - 1) / kPiece;
+  std::vector<uint64_t> differing_in(pieces);
+  executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
+    uint64_t bits = 0;
+    for (size_t i = begin; i < end; ++i) bits |= items[i].key ^ items[0].key;
+    differing_in[begin / kPiece] = bits;
+  });
+  uint64_t differing = 0;
+  for (const uint64_t bits : differing_in) differing |= bits;
   std::vector<std::array<uint32_t, kDigits>> first(pieces);
   std::vector<KeyedIndex> sorted(n);
   for (int shift = 0; shift < 64; shift += kDigitBits) {

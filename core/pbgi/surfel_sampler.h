@@ -62,7 +62,6 @@ class ObjectSampler {
   ObjectSurfels Sample();
 
  private:
-  struct Leaf;
   struct Impl;
   std::unique_ptr<Impl> impl_;
   Digest key_;

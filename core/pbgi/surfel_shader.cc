@@ -42,16 +42,27 @@ std::array<InteriorSet, kInteriorSets> MakeInteriorSets() {
   return sets;
 }
 
+// GeometricNormal of every triangle: rays ask for each many times.
+std::vector<Vec3f> NormalsOf(const PreparedScene& scene, Executor& executor) {
+  std::vector<Vec3f> normals(scene.triangles().size());
+  executor.ForEachPiece(normals.size(), kPiece, [&](size_t begin, size_t end) {
+    for (size_t t = begin; t < end; ++t) {
+      normals[t] = scene.GeometricNormal(static_cast<uint32_t>(t));
+    }
+  });
+  return normals;
+}
+
 // Whether all rays that leave `p` on the side of `ng` hit surfaces from behind.
-bool SeesOnlyBackFaces(const RayAccel& accel, const Vec3f& p, const Vec3f& ng,
-                       const InteriorSet& set, PieceCounts& counts) {
+bool SeesOnlyBackFaces(const RayAccel& accel, const std::vector<Vec3f>& normals, const Vec3f& p,
+                       const Vec3f& ng, const InteriorSet& set, PieceCounts& counts) {
   const Frame frame(ng);
   const Vec3f origin = accel.LeaveSurface(p, ng);
   for (const Vec3f& local : set) {
     const Vec3f w = frame.ToWorld(local);
     ++counts.interior;
     const std::optional<RayHit> hit = accel.Intersect(origin, w);
-    if (!hit || Dot(accel.scene().GeometricNormal(hit->triangle), w) < 0.0f) return false;
+    if (!hit || Dot(normals[hit->triangle], w) < 0.0f) return false;
   }
   return true;
 }
@@ -63,6 +74,8 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
   static const std::array<InteriorSet, kInteriorSets> sets = MakeInteriorSets();
   const size_t n = cloud.size();
   SurfelSides sides(n);
+  if (n == 0) return sides;
+  const std::vector<Vec3f> normals = NormalsOf(accel.scene(), executor);
   std::vector<PieceCounts> piece_counts((n + kPiece - 1) / kPiece);
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
     PieceCounts& counts = piece_counts[begin / kPiece];
@@ -72,7 +85,7 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
       for (unsigned side = 0; side < 2; ++side) {
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
         const InteriorSet& set = sets[HashKey(key, side, 5) % kInteriorSets];
-        if (!SeesOnlyBackFaces(accel, cloud.position[i], ng, set, counts)) {
+        if (!SeesOnlyBackFaces(accel, normals, cloud.position[i], ng, set, counts)) {
           open |= side == 0 ? kFrontVisible : kBackVisible;
         }
       }
