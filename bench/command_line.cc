@@ -14,7 +14,7 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array<std::string_view, 4> kNotBuilt = {"scale", "stability", "skip", "service"};
+constexpr std::array<std::string_view, 3> kNotBuilt = {"scale", "skip", "service"};
 
 // "1280x1000". Sizes are checked by ValidateFilm.
 bool ParseResolution(std::string_view text, int& width, int& height) {
@@ -70,7 +70,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
     return absl::UnimplementedError(
         "'" + args.front() +
-        "' is not built yet; use accuracy, paper, pareto, rebake, lights or micro");
+        "' is not built yet; use accuracy, paper, pareto, rebake, lights, micro or stability");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -247,17 +247,39 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
 
+  StabilityOptions& n = line.stability;
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) n.scenes_dir = scenes;
+  CLI::App* stability = app.add_subcommand(
+      "stability",
+      "Scenes that are moved, damaged or built to break a kernel; writes stability.json and "
+      "stability.html; 42 if a figure is above its bar");
+  AddCommonOptions(*stability, line.output_dir, n.quick);
+  stability->add_option("--case", n.cases, "Only this one; may be given more than once");
+  stability->add_option(
+      "--scenes", n.scenes_dir,
+      "Folder of scenes of others [FARPOINT_SCENES; without one Sponza is left out]");
+  stability->add_option("--points", n.points, "Surfels [20000, quick: 2500]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  stability->add_option("--light-samples", n.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  stability->add_option("--seed", n.seed, "Of every random choice")->capture_default_str();
+  stability->add_option("--threads", n.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
     app.parse(args);
   } catch (const CLI::CallForHelp&) {
-    const CLI::App* asked = pareto->parsed()   ? pareto
-                            : micro->parsed()  ? micro
-                            : rebake->parsed() ? rebake
-                            : lights->parsed() ? lights
-                            : paper->parsed()  ? paper
-                                               : &app;
+    const CLI::App* asked = pareto->parsed()      ? pareto
+                            : micro->parsed()     ? micro
+                            : rebake->parsed()    ? rebake
+                            : lights->parsed()    ? lights
+                            : paper->parsed()     ? paper
+                            : stability->parsed() ? stability
+                                                  : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
   } catch (const CLI::CallForVersion& version) {
@@ -266,12 +288,13 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   } catch (const CLI::ParseError& error) {
     return absl::InvalidArgumentError(std::string(error.what()) + "; see farpoint-bench --help");
   }
-  line.verb = pareto->parsed()     ? BenchVerb::kPareto
-              : rebake->parsed()   ? BenchVerb::kRebake
-              : lights->parsed()   ? BenchVerb::kLights
-              : accuracy->parsed() ? BenchVerb::kAccuracy
-              : paper->parsed()    ? BenchVerb::kPaper
-                                   : BenchVerb::kMicro;
+  line.verb = pareto->parsed()      ? BenchVerb::kPareto
+              : rebake->parsed()    ? BenchVerb::kRebake
+              : lights->parsed()    ? BenchVerb::kLights
+              : accuracy->parsed()  ? BenchVerb::kAccuracy
+              : paper->parsed()     ? BenchVerb::kPaper
+              : stability->parsed() ? BenchVerb::kStability
+                                    : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
   a.quality = *asked_quality;
@@ -329,6 +352,13 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                                       " is not WIDTHxHEIGHT in pixels, such as 640x480");
   }
   if (noise_option->count() > 0) p.noise = noise;
+  const std::vector<std::string> known_stability = StabilityNames();
+  for (const std::string& name : n.cases) {
+    if (std::find(known_stability.begin(), known_stability.end(), name) == known_stability.end()) {
+      return absl::InvalidArgumentError(
+          Concat({"--case ", name, " is none of ", absl::StrJoin(known_stability, ", ")}));
+    }
+  }
   if (line.output_dir.empty()) return absl::InvalidArgumentError("-o needs the name of a folder");
   return line;
 }

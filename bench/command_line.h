@@ -11,11 +11,12 @@
 #include "bench/paper.h"
 #include "bench/pareto.h"
 #include "bench/rebake.h"
+#include "bench/stability.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -26,6 +27,7 @@ struct BenchCommandLine {
   LightsOptions lights;
   AccuracyOptions accuracy;
   PaperOptions paper;
+  StabilityOptions stability;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -10,6 +10,7 @@
 #include "bench/command_line.h"
 #include "bench/paper_report.h"
 #include "bench/pareto_report.h"
+#include "bench/stability_report.h"
 #include "core/base/blob.h"
 #include "core/image/png_io.h"
 
@@ -106,6 +107,29 @@ absl::Status Paper(const BenchCommandLine& line, std::ostream& out, std::ostream
   return absl::OkStatus();
 }
 
+absl::Status Stability(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "stability.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const StabilityReport report,
+                      RunStability(line.stability, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_RETURN_IF_ERROR(WriteText(dir / "stability.json", StabilityJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "stability.html", StabilityHtml(report)));
+  out << StabilityTable(report) << "\n"
+      << (dir / "stability.json").string() << "\n"
+      << (dir / "stability.html").string() << "\n";
+  if (report.failures() > 0) {
+    return absl::FailedPreconditionError("stability: " + std::to_string(report.failures()) +
+                                         " figures are above their bar (the table lists them)");
+  }
+  return absl::OkStatus();
+}
+
 absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
   FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
                         err << "farpoint-bench: " << text << std::endl;
@@ -152,6 +176,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Accuracy(line, out, err);
     case BenchVerb::kPaper:
       return Paper(line, out, err);
+    case BenchVerb::kStability:
+      return Stability(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }

@@ -1,6 +1,9 @@
 // Primary rays of a perspective camera.
 #pragma once
 
+#include <optional>
+
+#include "core/accel/ray_accel.h"
 #include "core/image/tile_rect.h"
 #include "core/math/elementary.h"
 #include "core/scene/scene.h"
@@ -52,5 +55,16 @@ class CameraRays {
   Vec3d eye_, forward_, right_, up_;
   double width_, height_, half_height_;
 };
+
+// What an eye sees along the unit direction `w`: the nearest hit, but none within a surface offset.
+// An eye that lies on a surface, exactly or by its rounding, sees what lies before it.
+inline std::optional<RayHit> FirstSeen(const RayAccel& accel, const Vec3f& eye, const Vec3f& w) {
+  std::optional<RayHit> hit = accel.Intersect(eye, w);
+  const float offset = accel.surface_offset_m();
+  if (!hit || hit->t > offset) return hit;
+  hit = accel.Intersect(eye + w * offset, w);
+  if (hit) hit->t += offset;
+  return hit;
+}
 
 }  // namespace farpoint

@@ -356,7 +356,7 @@ class Renderer final : public FrameRenderer {
           const Vec3f w =
               rays_.Direction(x + static_cast<double>(offset.x), y + static_cast<double>(offset.y));
           ++n.rays;
-          const std::optional<RayHit> hit = scene_.accel->Intersect(rays_.eye(), w);
+          const std::optional<RayHit> hit = FirstSeen(*scene_.accel, rays_.eye(), w);
           Sample& sample = samples[at];
           if (!hit) {
             sample.emission = scene.EnvironmentRadiance(w);

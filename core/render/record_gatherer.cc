@@ -181,7 +181,7 @@ RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& r
 
 bool RecordGatherer::ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const {
   const Vec3f w = rays_.Direction(x + 0.5, y + 0.5);
-  const std::optional<RayHit> hit = scene_.accel->Intersect(rays_.eye(), w);
+  const std::optional<RayHit> hit = FirstSeen(*scene_.accel, rays_.eye(), w);
   if (!hit) return false;
   receiver = ReceiverOfHit(*scene_.scene, *hit, w);
   footprint_m = rays_.FootprintAt(receiver.position);

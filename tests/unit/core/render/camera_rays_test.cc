@@ -4,6 +4,10 @@
 
 #include <cmath>
 
+#include "core/base/executor.h"
+#include "core/scene/prepared_scene.h"
+#include "core/scene/procedural.h"
+
 namespace farpoint {
 namespace {
 
@@ -116,6 +120,25 @@ TEST(CameraRays, DirectionsAreUnit) {
       EXPECT_NEAR(Length(rays.Direction(x, y)), 1, 2e-7);
     }
   }
+}
+
+TEST(FirstSeen, AnEyeOnASurfaceSeesWhatLiesBeforeIt) {
+  // The floor of the box, looked at from a point of it: up to the ceiling, and down to nothing.
+  Executor executor(1);
+  const auto scene = PreparedScene::Prepare(MakeCornellBox(), executor).value();
+  const auto accel = RayAccel::Build(scene).value();
+  const Vec3f eye(Vec3d(2, 0, 3) - scene->origin());
+  const float offset = accel->surface_offset_m();
+  for (const Vec3f& on : {eye, eye - Vec3f(0, 0.25f, 0) * offset}) {
+    const auto up = FirstSeen(*accel, on, {0, 1, 0});
+    ASSERT_TRUE(up.has_value());
+    EXPECT_NEAR(up->t, 5.488, 1e-4);
+    EXPECT_FALSE(FirstSeen(*accel, on, {0, -1, 0}).has_value());
+  }
+  // Nothing is clipped beyond it.
+  const auto floor = FirstSeen(*accel, eye + Vec3f(0, 4, 0) * offset, {0, -1, 0});
+  ASSERT_TRUE(floor.has_value());
+  EXPECT_NEAR(floor->t / offset, 4, 0.5);
 }
 
 }  // namespace
