@@ -54,8 +54,7 @@ class Rasterizer {
     const float pixel_sr = map_.solid_angle()[j * static_cast<int>(side_) + i];
     ++counters_.splats;
     if (leaf) {
-      const NodeGroup& g = tree_.group(node.slot / kLanes);
-      const float radius_m = g.radius[node.slot % kLanes];
+      const float radius_m = tree_.surfel(node.slot).radius_m;
       if (kPif * radius_m * radius_m >
           kExactDiscPixels * kExactDiscPixels * pixel_sr * node.distance_m * node.distance_m) {
         ++counters_.exact_discs;
@@ -78,9 +77,8 @@ class Rasterizer {
   }
 
   // What the node reflects to the side from which it is seen.
-  const Rgb& Radiance(const CutNode& node) const {
-    const RadianceGroup::Sides& sides = tree_.radiance(node.slot / kLanes).lane[node.slot % kLanes];
-    return node.signed_solid_angle > 0.0f ? sides.front : sides.back;
+  Rgb Radiance(const CutNode& node) const {
+    return tree_.radiance_of(node.slot, node.signed_solid_angle > 0.0f);
   }
 
   // A dark back that is seen behind a front is, as a rule, the far side of the same closed object:
@@ -140,7 +138,8 @@ class Rasterizer {
     const int j0 = std::max(static_cast<int>(std::floor(at.y - half)), -1);
     const int j1 = std::min(static_cast<int>(std::floor(at.y + half)), n);
     const float* coverage = buffer_.coverage();
-    const Rgb* radiance = nullptr;  // looked up only if a pixel has room
+    Rgb radiance;  // looked up only if a pixel has room
+    bool found = false;
     for (int j = j0; j <= j1; ++j) {
       const float oy = std::min(at.y + half, static_cast<float>(j + 1)) -
                        std::max(at.y - half, static_cast<float>(j));
@@ -155,15 +154,18 @@ class Rasterizer {
                          std::max(at.x - half, static_cast<float>(i));
         const float part_sr = per_area * ox * oy;
         if (!(part_sr > 0.0f)) continue;
-        if (radiance == nullptr) radiance = &Radiance(node);
+        if (!found) {
+          radiance = Radiance(node);
+          found = true;
+        }
         AddCoverage(pixel, part_sr / map_.solid_angle()[pixel], node.distance_m,
-                    node.signed_solid_angle < 0.0f, *radiance);
+                    node.signed_solid_angle < 0.0f, radiance);
       }
     }
   }
 
   void DrawOpaqueBox(const CutNode& node, const Vec2f& at, float size) {
-    const Rgb& radiance = Radiance(node);
+    const Rgb radiance = Radiance(node);
     const float half = 0.5f * size;
     bool drawn = false;
     const int i0 = std::max(-1, static_cast<int>(std::ceil(at.x - half - 0.5f)));
@@ -190,12 +192,11 @@ class Rasterizer {
   // to the disc's centre, whose integral over the plane is the surfel's area.
   void DrawDisc(const CutNode& node) {
     const bool opaque = splat_ == Splat::kOpaque;
-    const NodeGroup& g = tree_.group(node.slot / kLanes);
-    const uint32_t lane = node.slot % kLanes;
-    const Rgb& radiance = Radiance(node);
+    const Surfel surfel = tree_.surfel(node.slot);
+    const Rgb radiance = Radiance(node);
     const Vec3f to_node = node.direction * node.distance_m;
-    const Vec3f normal(g.nx[lane], g.ny[lane], g.nz[lane]);
-    const float support_m = g.radius[lane] * (opaque ? kOpaqueDiscScale : kKernelSupport);
+    const Vec3f normal = surfel.normal;
+    const float support_m = surfel.radius_m * (opaque ? kOpaqueDiscScale : kKernelSupport);
     const float peak = 3.0f / (kKernelSupport * kKernelSupport);
     const Vec3f c = local_ ? ToLocal(to_node) : to_node;
     const Vec3f n = local_ ? ToLocal(normal) : normal;

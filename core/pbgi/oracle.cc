@@ -17,7 +17,7 @@ struct LiteralNode {
 };
 
 LiteralNode ReadNode(const PointTree& tree, uint32_t slot) {
-  const NodeGroup& g = tree.group(slot / kLanes);
+  const NodeGroup g = tree.group(slot / kLanes);
   const uint32_t k = slot % kLanes;
   return {{g.cx[k], g.cy[k], g.cz[k]},
           {g.nx[k], g.ny[k], g.nz[k]},
@@ -43,7 +43,7 @@ bool BelowEveryHorizon(const LiteralNode& n, const CutView& view) {
     top = height * view.cos_spread +
           std::sqrt(std::max(0.0, d * d - height * height)) * view.sin_spread;
   }
-  return top + reach + view.margin_m <= 0;
+  return top + reach + view.margin_m <= std::max(0.0, d - n.radius) / 512;
 }
 
 bool OnlyInvisibleSides(const LiteralNode& n, const CutView& view) {

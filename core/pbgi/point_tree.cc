@@ -7,7 +7,9 @@
 
 #include "core/base/byte_io.h"
 #include "core/base/check.h"
+#include "core/math/elementary.h"
 #include "core/pbgi/key_sort.h"
+#include "core/pbgi/packed_nodes.h"
 
 namespace farpoint {
 
@@ -15,11 +17,16 @@ namespace {
 
 constexpr uint32_t kTopologyMagic = 0x54545046;  // "FPTT"
 constexpr uint32_t kRadianceMagic = 0x52545046;  // "FPTR"
-constexpr uint32_t kVersion = 2;
+constexpr uint32_t kVersion = 3;
+constexpr size_t kHeaderBytes = 16;  // magic, version, number of surfels
 constexpr size_t kPiece = 4096;
 constexpr int kHilbertBits = 16;
+// Units of groups; far beyond any scene. kReachUnits bounds a group's distance from the origin in
+// its own units, so that kernels that count in them never come to infinity.
+constexpr float kLeastUnit = 0x1p-60f, kMostUnit = 0x1p50f, kReachUnits = 0x1p40f;
 
-// What building needs of a node beyond what is stored.
+// What building needs of a node beyond what is stored. All of it from the surfels as they are
+// stored.
 struct BuildNode {
   Box3f centres;     // of all surfels below
   float max_radius;  // of all surfels below
@@ -28,111 +35,222 @@ struct BuildNode {
   Vec3d area_centre;  // Σ A c
 };
 
-void SetEmpty(NodeGroup& g, uint32_t lane) {
-  g.cx[lane] = g.cy[lane] = g.cz[lane] = 0;
-  g.radius[lane] = -1;
-  g.thickness[lane] = 0;
-  g.nx[lane] = g.ny[lane] = g.nz[lane] = 0;
-  g.sin_cone[lane] = 0;
-  g.area[lane] = g.front_area[lane] = g.back_area[lane] = 0;
-}
-
-Vec3f Centre(const NodeGroup& g, uint32_t k) { return {g.cx[k], g.cy[k], g.cz[k]}; }
-Vec3f MeanNormal(const NodeGroup& g, uint32_t k) { return {g.nx[k], g.ny[k], g.nz[k]}; }
-
-float Sum(const float (&values)[kLanes], uint32_t count) {
+float Sum(const float (&values)[kLanes]) {
   double sum = 0;
-  for (uint32_t k = 0; k < count; ++k) sum += static_cast<double>(values[k]);
+  for (const float v : values) sum += static_cast<double>(v);
   return static_cast<float>(sum);
 }
 
-BuildNode SurfelNode(const NodeGroup& g, uint32_t k) {
+// A group's frame. `reach` is the largest coordinate of the tree.
+GroupFrame FrameFor(const Box3f& centres, float radius, float area, float reach) {
+  const float width = MaxComponent(centres.max - centres.min);
+  // All numbers fit with room for rounding up: centres 2^16, radii 2^15 halves, areas 2^14.
+  const float unit =
+      PowerOfTwoAbove(std::max({width * (1.0f / 65535.0f), radius * 0x1p-14f,
+                                std::sqrt(area) * 0x1p-17f, reach * (1.0f / kReachUnits)}));
+  return {{centres.min.x, centres.min.y, centres.min.z}, std::clamp(unit, kLeastUnit, kMostUnit)};
+}
+
+uint16_t Steps(float x, float origin, float unit) {
+  return static_cast<uint16_t>(std::clamp(std::nearbyint((x - origin) / unit), 0.0f, 65535.0f));
+}
+
+template <typename Group>
+void PackCentre(const Vec3f& c, uint32_t lane, Group& g) {
+  g.x[lane] = Steps(c.x, g.frame.origin[0], g.frame.unit);
+  g.y[lane] = Steps(c.y, g.frame.origin[1], g.frame.unit);
+  g.z[lane] = Steps(c.z, g.frame.origin[2], g.frame.unit);
+}
+
+// A disc of the surfel's area.
+float DiscRadius(float area) { return std::sqrt(area * 0.318309886183790672f); }
+
+// The surfels `order[0 … count - 1]`, count in [1, kLanes].
+PackedSurfels PackSurfels(const SurfelCloud& cloud, const SurfelSides& open_sides,
+                          const uint32_t* order, uint32_t count, float reach) {
+  Box3f box;
+  float radius = 0;
+  for (uint32_t k = 0; k < count; ++k) {
+    box.Extend(cloud.position[order[k]]);
+    radius = std::max(radius, DiscRadius(cloud.area_m2[order[k]]));
+  }
+  PackedSurfels g{};
+  g.frame = FrameFor(box, radius, 0, reach);
+  const float inverse_unit = 1.0f / g.frame.unit;
+  for (uint32_t k = 0; k < kLanes; ++k) {
+    if (k >= count) {
+      g.radius[k] = kEmptyRadius;
+      continue;
+    }
+    const uint32_t i = order[k];
+    PackCentre(cloud.position[i], k, g);
+    g.normal[k] = PackNormal(cloud.normal[i]) |
+                  ((open_sides[i] & kFrontVisible) != 0 ? kPackedFront : 0u) |
+                  ((open_sides[i] & kBackVisible) != 0 ? kPackedBack : 0u);
+    g.radius[k] = HalfNearest(DiscRadius(cloud.area_m2[i]) * inverse_unit);
+  }
+  return g;
+}
+
+// The node over surfels `s`.
+BuildNode OverSurfels(const NodeGroup& s, uint32_t count) {
   BuildNode b{};
-  b.centres.Extend(Centre(g, k));
-  b.max_radius = g.radius[k];
-  b.area = g.area[k];
-  b.area_normal = Vec3d(MeanNormal(g, k)) * b.area;
-  b.area_centre = Vec3d(Centre(g, k)) * b.area;
+  for (uint32_t k = 0; k < count; ++k) {
+    const Vec3f centre(s.cx[k], s.cy[k], s.cz[k]);
+    const double area = static_cast<double>(s.radius[k]) * static_cast<double>(s.radius[k]);
+    b.centres.Extend(centre);
+    b.max_radius = std::max(b.max_radius, s.radius[k]);
+    b.area += area;
+    b.area_normal += Vec3d(Vec3f(s.nx[k], s.ny[k], s.nz[k])) * area;
+    b.area_centre += Vec3d(centre) * area;
+  }
+  b.area *= kPi;
+  b.area_normal *= kPi;
+  b.area_centre *= kPi;
   return b;
 }
 
-// The node over the group `g` of the level below.
-void MakeParent(const NodeGroup& g, const BuildNode* children, uint32_t count, NodeGroup& out,
-                uint32_t lane, BuildNode& info) {
-  info = BuildNode{};
+// The node over others.
+BuildNode OverNodes(const BuildNode* children, uint32_t count) {
+  BuildNode b{};
   for (uint32_t k = 0; k < count; ++k) {
     const BuildNode& c = children[k];
-    info.centres.Extend(c.centres.min);
-    info.centres.Extend(c.centres.max);
-    info.max_radius = std::max(info.max_radius, c.max_radius);
-    info.area += c.area;
-    info.area_normal += c.area_normal;
-    info.area_centre += c.area_centre;
+    b.centres.Extend(c.centres.min);
+    b.centres.Extend(c.centres.max);
+    b.max_radius = std::max(b.max_radius, c.max_radius);
+    b.area += c.area;
+    b.area_normal += c.area_normal;
+    b.area_centre += c.area_centre;
   }
-  const Vec3f centre(info.area_centre / info.area);
-  const Vec3f mean(info.area_normal / info.area);
-  const Vec3f unit = NormalizeOr(mean, Vec3f(0, 0, 1));
-  // Two bounds of the radius: over the children's spheres, and over the box of the surfels.
-  float by_children = 0, thickness = 0, cos_cone = 1;
-  for (uint32_t k = 0; k < count; ++k) {
-    const Vec3f offset = Centre(g, k) - centre;
-    by_children = std::max(by_children, Length(offset) + g.radius[k]);
-    const Vec3f child_mean = MeanNormal(g, k);
-    const Vec3f child_unit = NormalizeOr(child_mean, Vec3f(0, 0, 1));
-    const float c = std::min(1.0f, std::fabs(Dot(child_unit, unit)));
-    const float tilt = std::sqrt(std::max(0.0f, 1.0f - c * c));
-    const float reach = std::min(g.radius[k], g.radius[k] * tilt + g.thickness[k] * c);
-    thickness = std::max(thickness, std::fabs(Dot(offset, unit)) + reach);
-    // cos(a + b) for the angle a between the normals and the child's own cone b.
-    const float cos_a = std::clamp(Dot(child_unit, unit), -1.0f, 1.0f);
-    const float sin_a = std::sqrt(std::max(0.0f, 1.0f - cos_a * cos_a));
-    const float sin_b = g.sin_cone[k];
-    const float cos_b = std::sqrt(std::max(0.0f, 1.0f - sin_b * sin_b));
-    cos_cone = std::min(cos_cone, sin_b >= 1.0f ? -1.0f : cos_a * cos_b - sin_a * sin_b);
-  }
-  const Vec3f corner = Max(info.centres.max - centre, centre - info.centres.min);
-  const float by_box = Length(corner) + info.max_radius;
-  // A few ulps wider, so that rounding never puts a disc outside.
-  const float radius = std::min(by_children, by_box) * (1.0f + 1e-6f);
-  out.cx[lane] = centre.x;
-  out.cy[lane] = centre.y;
-  out.cz[lane] = centre.z;
-  out.radius[lane] = radius;
-  out.thickness[lane] = std::min(radius, thickness * (1.0f + 1e-6f));
-  out.nx[lane] = mean.x;
-  out.ny[lane] = mean.y;
-  out.nz[lane] = mean.z;
-  out.sin_cone[lane] =
-      cos_cone <= 0.0f
-          ? 1.0f
-          : std::min(1.0f, std::sqrt(std::max(0.0f, 1.0f - cos_cone * cos_cone)) + 1e-6f);
-  out.area[lane] = static_cast<float>(info.area);
-  out.front_area[lane] = Sum(g.front_area, count);
-  out.back_area[lane] = Sum(g.back_area, count);
+  return b;
 }
 
-// Visible areas of the nodes of a group.
-struct SideAreas {
-  float front[kLanes], back[kLanes];
+// Holds all discs below a node.
+float RadiusByBox(const BuildNode& node, const Vec3f& centre) {
+  return Length(Max(node.centres.max - centre, centre - node.centres.min)) + node.max_radius;
+}
+
+// What holds all discs below a group, about a centre and a direction.
+struct Bounds {
+  float radius, thickness, sin_cone;
 };
 
-// Mean radiance of a side over the children, weighted by that side's visible area.
-void MakeParentRadiance(const SideAreas& areas, const RadianceGroup& r, RadianceGroup& out,
-                        uint32_t lane) {
-  double front_area = 0, back_area = 0;
+float Largest(F8 v) { return std::max({v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7]}); }
+
+Bounds BoundsOf(const NodeGroup& g, const BuildNode& node, const Vec3f& centre, const Vec3f& unit) {
+  const F8 zero = Set8(0.0f), one = Set8(1.0f);
+  const F8 radius = Load8(g.radius);
+  const M8 used = radius >= zero;
+  const V8 offset = V8(Load8(g.cx), Load8(g.cy), Load8(g.cz)) - V8(centre);
+  const V8 axis(unit);
+  // Two bounds of the radius: over the children's spheres, and over the box of the surfels.
+  const float by_children = Largest(Select8(used, Sqrt8(Dot(offset, offset)) + radius, zero));
+
+  const V8 normal = NormalizeOr(V8(Load8(g.nx), Load8(g.ny), Load8(g.nz)), V8(Vec3f(0, 0, 1)));
+  const F8 cos_a = Max8(Min8(Dot(normal, axis), one), -one);
+  const F8 c = Abs8(cos_a);
+  const F8 sin_a = Sqrt8(Max8(one - c * c, zero));
+  const F8 reach = Min8(radius, radius * sin_a + Load8(g.thickness) * c);
+  const float thickness = Largest(Select8(used, Abs8(Dot(offset, axis)) + reach, zero));
+  // cos(a + b) for the angle a between the normals and the child's own cone b.
+  const F8 sin_b = Load8(g.sin_cone);
+  const F8 cos_b = Sqrt8(Max8(one - sin_b * sin_b, zero));
+  const F8 cos_ab = Select8(sin_b >= one, -one, cos_a * cos_b - sin_a * sin_b);
+  const float cos_cone = -Largest(Select8(used, -cos_ab, -one));
+
+  // A few ulps wider, so that rounding never puts a disc outside.
+  constexpr float kWider = 1.0f + 1e-6f;
+  Bounds b;
+  b.radius = std::min(by_children, RadiusByBox(node, centre)) * kWider;
+  b.thickness = std::min(b.radius, thickness * kWider);
+  b.sin_cone = cos_cone <= 0.0f
+                   ? 1.0f
+                   : std::min(1.0f, std::sqrt(std::max(0.0f, 1.0f - cos_cone * cos_cone)) + 1e-6f);
+  return b;
+}
+
+// Stores what the children of a lane show.
+void SetVisible(const NodeGroup& children, uint32_t lane, PackedNodes& g) {
+  const float scale = 1.0f / (g.frame.unit * g.frame.unit * kAreaUnits);
+  g.front_area[lane] = HalfNearest(Sum(children.front_area) * scale);
+  g.back_area[lane] = HalfNearest(Sum(children.back_area) * scale);
+  g.normal[lane] = (g.normal[lane] & ~(kPackedFront | kPackedBack)) |
+                   (g.front_area[lane] != 0 ? kPackedFront : 0u) |
+                   (g.back_area[lane] != 0 ? kPackedBack : 0u);
+}
+
+// `count` nodes, in [1, kLanes]; children(k) gives the unpacked group below lane k.
+template <typename Children>
+PackedNodes PackNodes(const BuildNode* nodes, uint32_t count, float reach,
+                      const Children& children) {
+  Box3f box;
+  Vec3f centre[kLanes];
+  NodeGroup below[kLanes];
+  float radius = 0, area = 0;
+  for (uint32_t k = 0; k < count; ++k) {
+    below[k] = children(k);
+    const BuildNode& node = nodes[k];
+    // Surfels of no area have their centre in the middle.
+    centre[k] = node.area > 0 ? Vec3f(node.area_centre / node.area) : node.centres.Center();
+    box.Extend(centre[k]);
+    radius = std::max(radius, RadiusByBox(node, centre[k]));
+    area = std::max(area, static_cast<float>(node.area));
+  }
+  PackedNodes g{};
+  g.frame = FrameFor(box, radius, area, reach);
+  const float inverse_unit = 1.0f / g.frame.unit;
   for (uint32_t k = 0; k < kLanes; ++k) {
-    front_area += areas.front[k];
-    back_area += areas.back[k];
-  }
-  for (int c = 0; c < 3; ++c) {
-    double front = 0, back = 0;
-    for (uint32_t k = 0; k < kLanes; ++k) {
-      front += static_cast<double>(areas.front[k]) * r.lane[k].front[c];
-      back += static_cast<double>(areas.back[k]) * r.lane[k].back[c];
+    if (k >= count) {
+      g.radius[k] = kEmptyRadius;
+      continue;
     }
-    out.lane[lane].front[c] = front_area > 0 ? static_cast<float>(front / front_area) : 0.0f;
-    out.lane[lane].back[c] = back_area > 0 ? static_cast<float>(back / back_area) : 0.0f;
+    const BuildNode& node = nodes[k];
+    PackCentre(centre[k], k, g);
+    g.normal[k] = PackNormal(node.area > 0 ? Vec3f(node.area_normal / node.area) : Vec3f(0, 0, 0));
+    const Vec3f mean = UnpackNormal(g.normal[k]);
+    const float length = Length(mean);
+    const bool scattered = Length2(mean) < kMinCoherence2;
+    g.inverse_length[k] = static_cast<uint16_t>(
+        (length > 0.0f ? HalfBelow(1.0f / length) : uint16_t{0}) | (scattered ? 0x8000u : 0u));
+    const Bounds bounds = BoundsOf(below[k], node, CentreIn(g.frame, g.x[k], g.y[k], g.z[k]),
+                                   NormalizeOr(mean, Vec3f(0, 0, 1)));
+    g.radius[k] = HalfAbove(bounds.radius * inverse_unit);
+    g.thickness[k] = HalfAbove(bounds.thickness * inverse_unit);
+    g.sin_cone[k] = HalfAbove(bounds.sin_cone);
+    SetVisible(below[k], k, g);
   }
+  return g;
+}
+
+// Radiance of the sides of a node, and their visible areas.
+struct RadianceNode {
+  Rgb front, back;
+  float front_area, back_area;
+};
+
+// Means over the children of each side's radiance, weighted by that side's visible area.
+RadianceNode MeanRadiance(const RadianceNode* children, uint32_t count) {
+  double front_area = 0, back_area = 0;
+  Vec3d front, back;
+  for (uint32_t k = 0; k < count; ++k) {
+    const RadianceNode& c = children[k];
+    front_area += c.front_area;
+    back_area += c.back_area;
+    front += Vec3d(c.front) * static_cast<double>(c.front_area);
+    back += Vec3d(c.back) * static_cast<double>(c.back_area);
+  }
+  return {front_area > 0 ? Rgb(front / front_area) : Rgb(),
+          back_area > 0 ? Rgb(back / back_area) : Rgb(), static_cast<float>(front_area),
+          static_cast<float>(back_area)};
+}
+
+PackedRadiance PackRadiance(const RadianceNode* nodes, uint32_t count, const RadianceUnit& unit) {
+  PackedRadiance r{};
+  for (uint32_t k = 0; k < count; ++k) {
+    r.front[k] = unit.Pack(nodes[k].front);
+    r.back[k] = unit.Pack(nodes[k].back);
+  }
+  return r;
 }
 
 uint32_t GroupsFor(uint64_t nodes) { return static_cast<uint32_t>((nodes + kLanes - 1) / kLanes); }
@@ -184,6 +302,37 @@ uint64_t HilbertIndex(uint32_t x, uint32_t y, uint32_t z) {
   return index;
 }
 
+std::array<uint64_t, kLanes> HilbertIndex8(U8 x, U8 y, U8 z) {
+  U8 a[3] = {x, y, z};
+  for (uint32_t q = 1u << (kHilbertBits - 1); q > 1; q >>= 1) {
+    const uint32_t p = q - 1;
+    for (U8& v : a) {
+      const U8 set = reinterpret_cast<U8>((v & q) != 0);
+      const U8 t = (a[0] ^ v) & p & ~set;
+      a[0] ^= (set & p) | t;
+      v ^= t;
+    }
+  }
+  a[1] ^= a[0];
+  a[2] ^= a[1];
+  U8 t = {};
+  for (uint32_t q = 1u << (kHilbertBits - 1); q > 1; q >>= 1) {
+    t ^= reinterpret_cast<U8>((a[2] & q) != 0) & (q - 1);
+  }
+  // Bit i of the 16 goes to bit 3 i.
+  const auto spread = [](uint64_t v) {
+    v = (v | v << 16) & 0x0000ff0000ffull;
+    v = (v | v << 8) & 0x00f00f00f00full;
+    v = (v | v << 4) & 0x0c30c30c30c3ull;
+    return (v | v << 2) & 0x249249249249ull;
+  };
+  std::array<uint64_t, kLanes> index;
+  for (size_t k = 0; k < kLanes; ++k) {
+    index[k] = spread(a[0][k] ^ t[k]) << 2 | spread(a[1][k] ^ t[k]) << 1 | spread(a[2][k] ^ t[k]);
+  }
+  return index;
+}
+
 namespace {
 
 // The levels of a tree over `surfels`.
@@ -198,8 +347,11 @@ struct Levels {
       groups += GroupsFor(size);
     }
   }
-  uint32_t children(size_t level, size_t at) const {
-    return static_cast<uint32_t>(std::min<uint64_t>(kLanes, sizes[level - 1] - at * kLanes));
+  // Groups of level 0.
+  uint64_t leaf_groups() const { return sizes.empty() ? 0 : GroupsFor(sizes[0]); }
+  // Nodes in group `at` of a level.
+  uint32_t lanes(size_t level, size_t at) const {
+    return static_cast<uint32_t>(std::min<uint64_t>(kLanes, sizes[level] - at * kLanes));
   }
 };
 
@@ -216,33 +368,59 @@ T* AddArray(AlignedVector<std::byte>& record, uint64_t count) {
 AlignedVector<std::byte> Header(uint32_t magic, uint64_t surfels, size_t reserve) {
   AlignedVector<std::byte> record;
   record.reserve(reserve);
-  record.resize(2 * sizeof(uint32_t) + sizeof(uint64_t));
+  record.resize(kHeaderBytes);
   std::memcpy(record.data(), &magic, sizeof magic);
   std::memcpy(record.data() + 4, &kVersion, sizeof kVersion);
   std::memcpy(record.data() + 8, &surfels, sizeof surfels);
   return record;
 }
 
-// Surfels by (class, Hilbert index, position in the cloud).
-std::vector<uint32_t> SortSurfels(const SurfelCloud& cloud, Executor& executor) {
-  const size_t n = cloud.size();
+Box3f BoxOf(const std::vector<Vec3f>& points, Executor& executor) {
+  constexpr size_t kPoints = size_t{1} << 16;
+  std::vector<Box3f> boxes((points.size() + kPoints - 1) / kPoints);
+  executor.ForEachPiece(points.size(), kPoints, [&](size_t begin, size_t end) {
+    Box3f box;
+    for (size_t i = begin; i < end; ++i) box.Extend(points[i]);
+    boxes[begin / kPoints] = box;
+  });
   Box3f box;
-  for (const Vec3f& p : cloud.position) box.Extend(p);
+  for (const Box3f& b : boxes) {
+    box.Extend(b.min);
+    box.Extend(b.max);
+  }
+  return box;
+}
+
+// Surfels by (class, Hilbert index, position in the cloud).
+std::vector<uint32_t> SortSurfels(const SurfelCloud& cloud, const Box3f& box, Executor& executor) {
+  const size_t n = cloud.size();
   const float edge = box.empty() ? 0.0f : MaxComponent(box.max - box.min);
   const float scale = edge > 0.0f ? 65535.0f / edge : 0.0f;
   std::vector<KeyedIndex> keys(n);
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end; ++i) {
-      const Vec3f q = (cloud.position[i] - box.min) * scale;
-      keys[i] = {(static_cast<uint64_t>(NormalClass(cloud.normal[i])) << (3 * kHilbertBits)) |
-                     HilbertIndex(static_cast<uint32_t>(q.x), static_cast<uint32_t>(q.y),
-                                  static_cast<uint32_t>(q.z)),
-                 static_cast<uint32_t>(i)};
+    for (size_t i = begin; i < end; i += kLanes) {
+      const auto count = static_cast<uint32_t>(std::min<size_t>(kLanes, end - i));
+      U8 x = {}, y = {}, z = {};
+      for (uint32_t k = 0; k < count; ++k) {
+        const Vec3f q = (cloud.position[i + k] - box.min) * scale;
+        x[k] = static_cast<uint32_t>(q.x);
+        y[k] = static_cast<uint32_t>(q.y);
+        z[k] = static_cast<uint32_t>(q.z);
+      }
+      const std::array<uint64_t, kLanes> index = HilbertIndex8(x, y, z);
+      for (uint32_t k = 0; k < count; ++k) {
+        keys[i + k] = {static_cast<uint64_t>(NormalClass(cloud.normal[i + k]))
+                               << (3 * kHilbertBits) |
+                           index[k],
+                       static_cast<uint32_t>(i + k)};
+      }
     }
   });
   SortByKey(keys, executor);
   std::vector<uint32_t> order(n);
-  for (size_t i = 0; i < n; ++i) order[i] = keys[i].index;
+  executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) order[i] = keys[i].index;
+  });
   return order;
 }
 
@@ -252,67 +430,44 @@ PointTree::Topology PointTree::BuildTopology(const SurfelCloud& cloud,
                                              const SurfelSides& open_sides, Executor& executor) {
   const size_t n = cloud.size();
   FP_CHECK(open_sides.size() == n);
+  const Box3f box = BoxOf(cloud.position, executor);
+  const float reach = n > 0 ? std::max(MaxAbs(box.min), MaxAbs(box.max)) : 0.0f;
   Topology topology;
-  topology.order = SortSurfels(cloud, executor);
+  topology.order = SortSurfels(cloud, box, executor);
   const Levels levels(n);
-  auto record = Header(kTopologyMagic, n, 2 * kBlobAlignment + levels.groups * sizeof(NodeGroup));
-  NodeGroup* const nodes = AddArray<NodeGroup>(record, levels.groups);
+  const uint64_t leaf_groups = levels.leaf_groups(), inner_groups = levels.groups - leaf_groups;
+  auto record = Header(kTopologyMagic, n,
+                       4 * kBlobAlignment + leaf_groups * sizeof(PackedSurfels) +
+                           inner_groups * sizeof(PackedNodes));
+  // The record has room for both: it does not move.
+  PackedSurfels* const surfels = AddArray<PackedSurfels>(record, leaf_groups);
+  PackedNodes* const nodes = AddArray<PackedNodes>(record, inner_groups);
 
-  executor.ForEachPiece(GroupsFor(n), kPiece / kLanes, [&](size_t begin, size_t end) {
-    for (size_t gi = begin; gi < end; ++gi) {
-      NodeGroup& g = nodes[gi];
-      for (uint32_t k = 0; k < kLanes; ++k) {
-        const size_t at = gi * kLanes + k;
-        if (at >= n) {
-          SetEmpty(g, k);
-          continue;
-        }
-        const uint32_t i = topology.order[at];
-        const Vec3f p = cloud.position[i];
-        const Vec3f normal = cloud.normal[i];
-        const float area = cloud.area_m2[i];
-        g.cx[k] = p.x;
-        g.cy[k] = p.y;
-        g.cz[k] = p.z;
-        g.radius[k] = std::sqrt(area * 0.318309886183790672f);  // a disc of the surfel's area
-        g.thickness[k] = 0;
-        g.nx[k] = normal.x;
-        g.ny[k] = normal.y;
-        g.nz[k] = normal.z;
-        g.sin_cone[k] = 0;
-        g.area[k] = area;
-        g.front_area[k] = (open_sides[i] & kFrontVisible) != 0 ? area : 0.0f;
-        g.back_area[k] = (open_sides[i] & kBackVisible) != 0 ? area : 0.0f;
-      }
+  std::vector<BuildNode> here(leaf_groups), above;  // nodes of the level at hand, and of the next
+  executor.ForEachPiece(leaf_groups, kPiece / kLanes, [&](size_t begin, size_t end) {
+    for (size_t g = begin; g < end; ++g) {
+      const uint32_t count = levels.lanes(0, g);
+      surfels[g] = PackSurfels(cloud, open_sides, &topology.order[g * kLanes], count, reach);
+      here[g] = OverSurfels(Unpack(surfels[g]), count);
     }
   });
-
-  std::vector<BuildNode> below, above;
   for (size_t level = 1; level < levels.sizes.size(); ++level) {
-    const size_t count = levels.sizes[level];
-    above.assign(count, BuildNode{});
-    executor.ForEachPiece(GroupsFor(count), kPiece / kLanes, [&](size_t begin, size_t end) {
-      for (size_t gi = begin; gi < end; ++gi) {
-        NodeGroup& g = nodes[levels.first_group[level] + gi];
-        for (uint32_t k = 0; k < kLanes; ++k) {
-          const size_t at = gi * kLanes + k;
-          if (at >= count) {
-            SetEmpty(g, k);
-            continue;
-          }
-          const uint32_t children = levels.children(level, at);
-          const NodeGroup& child_group = nodes[levels.first_group[level - 1] + at];
-          if (level > 1) {
-            MakeParent(child_group, &below[at * kLanes], children, g, k, above[at]);
-            continue;
-          }
-          BuildNode surfels[kLanes];
-          for (uint32_t c = 0; c < children; ++c) surfels[c] = SurfelNode(child_group, c);
-          MakeParent(child_group, surfels, children, g, k, above[at]);
-        }
+    const size_t groups = GroupsFor(levels.sizes[level]);
+    above.resize(groups);
+    PackedNodes* const out = nodes + (levels.first_group[level] - leaf_groups);
+    executor.ForEachPiece(groups, kPiece / kLanes, [&](size_t begin, size_t end) {
+      for (size_t g = begin; g < end; ++g) {
+        const uint32_t count = levels.lanes(level, g);
+        const BuildNode* const of_group = &here[g * kLanes];
+        out[g] = PackNodes(of_group, count, reach, [&](uint32_t k) {
+          const size_t child = g * kLanes + k;
+          return level == 1 ? Unpack(surfels[child])
+                            : Unpack(nodes[levels.first_group[level - 1] - leaf_groups + child]);
+        });
+        above[g] = OverNodes(of_group, count);
       }
     });
-    below.swap(above);
+    here.swap(above);
   }
   topology.blob = Blob::FromAligned(std::move(record));
   return topology;
@@ -325,48 +480,68 @@ Blob PointTree::BuildRadiance(const Topology& topology, const SurfelCloud& cloud
   FP_CHECK(topology.order.size() == n && open_sides.size() == n && shading.front.size() == n &&
            shading.back.size() == n && shading.visible_sides.size() == n);
   const Levels levels(n);
-  std::vector<uint32_t> lit_sides;
-  for (size_t slot = 0; slot < n; ++slot) {
-    const uint32_t i = topology.order[slot];
-    const unsigned lit = shading.visible_sides[i] & ~static_cast<unsigned>(open_sides[i]);
-    if ((lit & kFrontVisible) != 0) lit_sides.push_back(static_cast<uint32_t>(slot * 2));
-    if ((lit & kBackVisible) != 0) lit_sides.push_back(static_cast<uint32_t>(slot * 2 + 1));
-  }
-  auto record = Header(kRadianceMagic, n,
-                       4 * kBlobAlignment + lit_sides.size() * sizeof(uint32_t) +
-                           levels.groups * sizeof(RadianceGroup));
-  std::copy(lit_sides.begin(), lit_sides.end(), AddArray<uint32_t>(record, lit_sides.size()));
-  RadianceGroup* const radiance = AddArray<RadianceGroup>(record, levels.groups);
-
-  // The visible areas are summed as those of the nodes are, so that they are the same numbers.
-  std::vector<SideAreas> below(GroupsFor(n)), above;
-  executor.ForEachPiece(GroupsFor(n), kPiece / kLanes, [&](size_t begin, size_t end) {
-    for (size_t gi = begin; gi < end; ++gi) {
-      below[gi] = SideAreas{};
-      for (uint32_t k = 0; k < kLanes && gi * kLanes + k < n; ++k) {
-        const uint32_t i = topology.order[gi * kLanes + k];
-        radiance[gi].lane[k] = {shading.front[i], shading.back[i]};
-        const unsigned visible = shading.visible_sides[i] | open_sides[i];
-        if ((visible & kFrontVisible) != 0) below[gi].front[k] = cloud.area_m2[i];
-        if ((visible & kBackVisible) != 0) below[gi].back[k] = cloud.area_m2[i];
+  const uint64_t leaf_groups = levels.leaf_groups();
+  std::vector<std::vector<uint32_t>> lit_in((n + kPiece - 1) / kPiece);
+  std::vector<float> brightest_in(lit_in.size());
+  executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
+    float brightest = 0;
+    for (size_t slot = begin; slot < end; ++slot) {
+      const uint32_t i = topology.order[slot];
+      const unsigned lit = shading.visible_sides[i] & ~static_cast<unsigned>(open_sides[i]);
+      if ((lit & kFrontVisible) != 0) {
+        lit_in[begin / kPiece].push_back(static_cast<uint32_t>(slot * 2));
       }
+      if ((lit & kBackVisible) != 0) {
+        lit_in[begin / kPiece].push_back(static_cast<uint32_t>(slot * 2 + 1));
+      }
+      brightest =
+          std::max({brightest, MaxComponent(shading.front[i]), MaxComponent(shading.back[i])});
+    }
+    brightest_in[begin / kPiece] = brightest;
+  });
+  std::vector<uint32_t> lit_sides;
+  for (const auto& lit : lit_in) lit_sides.insert(lit_sides.end(), lit.begin(), lit.end());
+  float brightest = 0;
+  for (const float b : brightest_in) brightest = std::max(brightest, b);
+  const RadianceUnit unit = RadianceUnit::For(brightest);
+
+  auto record = Header(kRadianceMagic, n,
+                       5 * kBlobAlignment + lit_sides.size() * sizeof(uint32_t) +
+                           levels.groups * sizeof(PackedRadiance));
+  const float unit_value = unit.unit();
+  record.resize(record.size() + sizeof unit_value);
+  std::memcpy(record.data() + kHeaderBytes, &unit_value, sizeof unit_value);
+  std::copy(lit_sides.begin(), lit_sides.end(), AddArray<uint32_t>(record, lit_sides.size()));
+  PackedRadiance* const radiance = AddArray<PackedRadiance>(record, levels.groups);
+
+  std::vector<RadianceNode> here(leaf_groups), above;
+  executor.ForEachPiece(leaf_groups, kPiece / kLanes, [&](size_t begin, size_t end) {
+    for (size_t g = begin; g < end; ++g) {
+      const uint32_t count = levels.lanes(0, g);
+      RadianceNode surfels[kLanes];
+      for (uint32_t k = 0; k < count; ++k) {
+        const uint32_t i = topology.order[g * kLanes + k];
+        const unsigned visible = shading.visible_sides[i] | open_sides[i];
+        const float area = cloud.area_m2[i];
+        surfels[k] = {shading.front[i], shading.back[i],
+                      (visible & kFrontVisible) != 0 ? area : 0.0f,
+                      (visible & kBackVisible) != 0 ? area : 0.0f};
+      }
+      radiance[g] = PackRadiance(surfels, count, unit);
+      here[g] = MeanRadiance(surfels, count);
     }
   });
   for (size_t level = 1; level < levels.sizes.size(); ++level) {
-    const size_t count = levels.sizes[level];
-    above.assign(GroupsFor(count), SideAreas{});
-    executor.ForEachPiece(GroupsFor(count), kPiece / kLanes, [&](size_t begin, size_t end) {
-      for (size_t gi = begin; gi < end; ++gi) {
-        for (uint32_t k = 0; k < kLanes && gi * kLanes + k < count; ++k) {
-          const size_t at = gi * kLanes + k;
-          MakeParentRadiance(below[at], radiance[levels.first_group[level - 1] + at],
-                             radiance[levels.first_group[level] + gi], k);
-          above[gi].front[k] = Sum(below[at].front, kLanes);
-          above[gi].back[k] = Sum(below[at].back, kLanes);
-        }
+    const size_t groups = GroupsFor(levels.sizes[level]);
+    above.resize(groups);
+    executor.ForEachPiece(groups, kPiece / kLanes, [&](size_t begin, size_t end) {
+      for (size_t g = begin; g < end; ++g) {
+        const uint32_t count = levels.lanes(level, g);
+        radiance[levels.first_group[level] + g] = PackRadiance(&here[g * kLanes], count, unit);
+        above[g] = MeanRadiance(&here[g * kLanes], count);
       }
     });
-    below.swap(above);
+    here.swap(above);
   }
   return Blob::FromAligned(std::move(record));
 }
@@ -386,35 +561,82 @@ uint64_t PointTree::NodeCount(uint64_t surfels) {
 
 absl::Status PointTree::AddVisible(std::span<const uint32_t> lit_sides) {
   if (lit_sides.empty()) return absl::OkStatus();
-  own_groups_.assign(groups_.begin(), groups_.end());
-  std::vector<uint32_t> changed;  // slots of the level at hand, ascending
+  own_surfels_.assign(surfels_.begin(), surfels_.end());
+  own_nodes_.assign(nodes_.begin(), nodes_.end());
+  std::vector<uint32_t> changed;  // groups of the level at hand, ascending
   for (size_t i = 0; i < lit_sides.size(); ++i) {
     const uint32_t slot = lit_sides[i] / 2;
     if (slot >= surfel_count_ || (i > 0 && lit_sides[i] <= lit_sides[i - 1])) {
       return absl::DataLossError("point tree radiance: entry " + std::to_string(i) +
                                  " of the lit sides is out of order or names no surfel");
     }
-    NodeGroup& g = own_groups_[slot / kLanes];
-    (lit_sides[i] % 2 == 0 ? g.front_area : g.back_area)[slot % kLanes] = g.area[slot % kLanes];
-    if (changed.empty() || changed.back() != slot) changed.push_back(slot);
+    own_surfels_[slot / kLanes].normal[slot % kLanes] |=
+        lit_sides[i] % 2 == 0 ? kPackedFront : kPackedBack;
+    if (changed.empty() || changed.back() != slot / kLanes) changed.push_back(slot / kLanes);
   }
   const Levels levels(surfel_count_);
+  const uint64_t leaf_groups = levels.leaf_groups();
   for (size_t level = 1; level < levels.sizes.size(); ++level) {
     size_t kept = 0;
-    for (const uint32_t slot : changed) {
-      const uint32_t parent = slot / kLanes;
-      if (kept > 0 && changed[kept - 1] == parent) continue;
-      changed[kept++] = parent;
-      const NodeGroup& children = own_groups_[levels.first_group[level - 1] + parent];
-      NodeGroup& g = own_groups_[levels.first_group[level] + parent / kLanes];
-      g.front_area[parent % kLanes] = Sum(children.front_area, kLanes);
-      g.back_area[parent % kLanes] = Sum(children.back_area, kLanes);
+    // The group below is that of the node of the same index.
+    for (const uint32_t node : changed) {
+      PackedNodes& g = own_nodes_[levels.first_group[level] - leaf_groups + node / kLanes];
+      const NodeGroup below =
+          level == 1 ? Unpack(own_surfels_[node])
+                     : Unpack(own_nodes_[levels.first_group[level - 1] - leaf_groups + node]);
+      SetVisible(below, node % kLanes, g);
+      if (kept == 0 || changed[kept - 1] != node / kLanes) changed[kept++] = node / kLanes;
     }
     changed.resize(kept);
   }
-  groups_ = own_groups_;
+  surfels_ = own_surfels_;
+  nodes_ = own_nodes_;
   return absl::OkStatus();
 }
+
+namespace {
+
+bool IsPowerOfTwo(float x, float least, float most) {
+  return x >= least && x <= most && (std::bit_cast<uint32_t>(x) & 0x7fffffu) == 0;
+}
+bool IsSane(const GroupFrame& f) {
+  if (!IsPowerOfTwo(f.unit, kLeastUnit, kMostUnit)) return false;
+  // Twice what FrameFor leaves, for rounding.
+  const float most = f.unit * (2.0f * kReachUnits);
+  return std::fabs(f.origin[0]) <= most && std::fabs(f.origin[1]) <= most &&
+         std::fabs(f.origin[2]) <= most;
+}
+bool IsFiniteHalf(uint16_t h) { return h < 0x7c00; }                           // and not negative
+bool IsComponent(uint32_t ten_bits) { return (ten_bits & 0x3ffu) != 0x200u; }  // not -512
+bool IsNormal(uint32_t word) {
+  return IsComponent(word) && IsComponent(word >> 10) && IsComponent(word >> 20);
+}
+
+bool IsSane(const PackedSurfels& g, uint32_t count) {
+  bool sane = IsSane(g.frame);
+  for (uint32_t k = 0; k < kLanes; ++k) {
+    sane &= k < count ? IsFiniteHalf(g.radius[k]) && IsNormal(g.normal[k])
+                      : g.radius[k] == kEmptyRadius && g.normal[k] == 0;
+  }
+  return sane;
+}
+
+bool IsSane(const PackedNodes& g, uint32_t count) {
+  constexpr uint16_t kOne = 0x3c00;
+  bool sane = IsSane(g.frame);
+  for (uint32_t k = 0; k < kLanes; ++k) {
+    const uint32_t visible =
+        (g.front_area[k] != 0 ? kPackedFront : 0u) | (g.back_area[k] != 0 ? kPackedBack : 0u);
+    sane &= k < count ? IsFiniteHalf(g.radius[k]) && IsNormal(g.normal[k])
+                      : g.radius[k] == kEmptyRadius && g.normal[k] == 0;
+    sane &= IsFiniteHalf(g.thickness[k]) && g.sin_cone[k] <= kOne &&
+            IsFiniteHalf(g.inverse_length[k] & 0x7fffu) && IsFiniteHalf(g.front_area[k]) &&
+            IsFiniteHalf(g.back_area[k]) && (g.normal[k] & (kPackedFront | kPackedBack)) == visible;
+  }
+  return sane;
+}
+
+}  // namespace
 
 absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topology,
                                                                       Blob radiance) {
@@ -430,7 +652,8 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
                                ", this program reads version " + std::to_string(kVersion));
   }
   FP_RETURN_IF_ERROR(reader.Get(n, "surfel count"));
-  FP_RETURN_IF_ERROR(reader.GetArray(tree->groups_, "groups"));
+  FP_RETURN_IF_ERROR(reader.GetArray(tree->surfels_, "groups of surfels"));
+  FP_RETURN_IF_ERROR(reader.GetArray(tree->nodes_, "groups of nodes"));
   FP_RETURN_IF_ERROR(reader.ExpectEnd());
 
   ByteReader light(radiance.bytes());
@@ -442,6 +665,8 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
                                ", this program reads version " + std::to_string(kVersion));
   }
   FP_RETURN_IF_ERROR(light.Get(n_radiance, "surfel count"));
+  float unit = 0;
+  FP_RETURN_IF_ERROR(light.Get(unit, "unit of radiance"));
   std::span<const uint32_t> lit_sides;
   FP_RETURN_IF_ERROR(light.GetArray(lit_sides, "lit sides"));
   FP_RETURN_IF_ERROR(light.GetArray(tree->radiance_, "groups"));
@@ -451,43 +676,40 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
     return absl::DataLossError("point tree: topology is of " + std::to_string(n) +
                                " surfels, radiance of " + std::to_string(n_radiance));
   }
-  uint64_t groups = 0;
-  for (const uint64_t size : LevelSizes(n)) {
-    tree->first_group_.push_back(static_cast<uint32_t>(groups));
-    groups += GroupsFor(size);
-    tree->node_count_ += size;
-  }
-  if (groups != tree->groups_.size() || groups != tree->radiance_.size()) {
+  const Levels levels(n);
+  tree->first_group_ = levels.first_group;
+  for (const uint64_t size : levels.sizes) tree->node_count_ += size;
+  if (levels.leaf_groups() != tree->surfels_.size() ||
+      levels.groups - levels.leaf_groups() != tree->nodes_.size() ||
+      levels.groups != tree->radiance_.size()) {
     return absl::DataLossError("point tree of " + std::to_string(n) + " surfels should have " +
-                               std::to_string(groups) + " groups, the blobs have " +
-                               std::to_string(tree->groups_.size()) + " and " +
-                               std::to_string(tree->radiance_.size()));
+                               std::to_string(levels.leaf_groups()) + " groups of surfels and " +
+                               std::to_string(levels.groups) + " in all, the blobs have " +
+                               std::to_string(tree->surfels_.size()) + ", " +
+                               std::to_string(tree->surfels_.size() + tree->nodes_.size()) +
+                               " and radiance of " + std::to_string(tree->radiance_.size()));
   }
   // One pass over the numbers: kernels trust them afterwards.
-  bool sane = true, lit = false;
-  for (const NodeGroup& g : tree->groups_) {
-    for (uint32_t k = 0; k < kLanes; ++k) {
-      sane &= std::isfinite(g.cx[k]) & std::isfinite(g.cy[k]) & std::isfinite(g.cz[k]) &
-              std::isfinite(g.radius[k]) & (g.thickness[k] >= 0) & std::isfinite(g.thickness[k]) &
-              (std::fabs(g.nx[k]) <= 1.001f) & (std::fabs(g.ny[k]) <= 1.001f) &
-              (std::fabs(g.nz[k]) <= 1.001f) & (g.sin_cone[k] >= 0) & (g.sin_cone[k] <= 1) &
-              (g.area[k] >= 0) & std::isfinite(g.area[k]) & (g.front_area[k] >= 0) &
-              std::isfinite(g.front_area[k]) & (g.back_area[k] >= 0) &
-              std::isfinite(g.back_area[k]);
-    }
-  }
-  for (const RadianceGroup& r : tree->radiance_) {
-    for (const RadianceGroup::Sides& sides : r.lane) {
-      for (int c = 0; c < 3; ++c) {
-        const float front = sides.front[c], back = sides.back[c];
-        sane &= (front >= 0) & std::isfinite(front) & (back >= 0) & std::isfinite(back);
-        lit |= (front > 0) | (back > 0);
-      }
+  bool sane = IsPowerOfTwo(unit, 0x1p-126f, 0x1p88f);
+  for (size_t level = 0; level < levels.sizes.size(); ++level) {
+    const size_t groups = GroupsFor(levels.sizes[level]);
+    for (size_t g = 0; g < groups; ++g) {
+      const uint32_t count = levels.lanes(level, g);
+      sane &=
+          level == 0
+              ? IsSane(tree->surfels_[g], count)
+              : IsSane(tree->nodes_[levels.first_group[level] - levels.leaf_groups() + g], count);
     }
   }
   if (!sane) return absl::DataLossError("point tree holds values that no tree can have");
+  constexpr uint32_t kMantissas = (1u << 27) - 1;
+  uint32_t light_bits = 0;
+  for (const PackedRadiance& r : tree->radiance_) {
+    for (uint32_t k = 0; k < kLanes; ++k) light_bits |= r.front[k] | r.back[k];
+  }
   tree->surfel_count_ = n;
-  tree->lit_ = lit;
+  tree->unit_ = RadianceUnit(unit);
+  tree->lit_ = (light_bits & kMantissas) != 0;
   FP_RETURN_IF_ERROR(tree->AddVisible(lit_sides));
   if (lit_sides.empty()) tree->topology_ = std::move(topology);
   tree->radiance_blob_ = std::move(radiance);

@@ -8,7 +8,8 @@
 // directions the exact dot product of two vectors: Σ A_k n_k · ω = (Σ A_k n_k) · ω.
 //
 // A *slot* is one node (a surfel at level 0); a *group* is eight slots stored side by side for
-// SIMD. Slots beyond the last node of a level are empty: area 0 and radius -1.
+// SIMD, quantised (core/pbgi/packed_nodes.h). Slots beyond the last node of a level are empty:
+// area 0 and radius -1.
 #pragma once
 
 #include <array>
@@ -21,33 +22,31 @@
 #include "core/base/blob.h"
 #include "core/base/executor.h"
 #include "core/base/status.h"
+#include "core/pbgi/packed_nodes.h"
 #include "core/pbgi/surfel.h"
 
 namespace farpoint {
 
-inline constexpr uint32_t kLanes = 8;
-
-// Eight nodes. Lengths in metres, positions relative to the scene's origin.
-struct alignas(32) NodeGroup {
-  float cx[kLanes], cy[kLanes], cz[kLanes];  // area-weighted centre
-  float radius[kLanes];     // of a sphere about the centre that holds all discs; -1: empty slot
-  float thickness[kLanes];  // half height along the mean normal of all discs below
-  float nx[kLanes], ny[kLanes], nz[kLanes];  // Σ A n / Σ A: as short as the normals spread
-  float sin_cone[kLanes];    // sine of the largest angle to the mean normal; 1: 90° or more
-  float area[kLanes];        // Σ A, m²
-  float front_area[kLanes];  // Σ A of surfels whose front is visible (in the topology blob: open)
-  float back_area[kLanes];   // Σ A of surfels whose back is visible
-};
-static_assert(sizeof(NodeGroup) == 384);
-
 // What the nodes of a group reflect to the front (towards +n) and to the back: means weighted by
 // visible area.
-struct alignas(32) RadianceGroup {
-  struct Sides {
-    Rgb front, back;
-  } lane[kLanes];
+struct RadianceSides {
+  Rgb front, back;
 };
-static_assert(sizeof(RadianceGroup) == 192);
+struct RadianceGroup {
+  RadianceSides lane[kLanes];
+};
+
+// RadianceSides of eight slots (RadianceUnit).
+struct alignas(64) PackedRadiance {
+  uint32_t front[kLanes], back[kLanes];
+};
+static_assert(sizeof(PackedRadiance) == 64);
+
+// One surfel, unpacked.
+struct Surfel {
+  Vec3f position, normal;
+  float radius_m;
+};
 
 class PointTree {
  public:
@@ -93,14 +92,40 @@ class PointTree {
   uint32_t ChildGroup(int level, uint32_t slot) const {
     return first_group_[level - 1] + (slot - first_group_[level] * kLanes);
   }
-  const NodeGroup& group(uint32_t g) const { return groups_[g]; }
-  const RadianceGroup& radiance(uint32_t g) const { return radiance_[g]; }
-  std::span<const NodeGroup> groups() const { return groups_; }
+  uint32_t group_count() const { return static_cast<uint32_t>(surfels_.size() + nodes_.size()); }
   uint32_t first_group(int level) const { return first_group_[level]; }
+  // As they are stored: groups of level 0, and those of the others.
+  const PackedSurfels& packed_surfels(uint32_t g) const { return surfels_[g]; }
+  const PackedNodes& packed_nodes(uint32_t g) const { return nodes_[g - surfels_.size()]; }
+  // Unpacked copies.
+  NodeGroup group(uint32_t g) const {
+    return g < surfels_.size() ? Unpack(surfels_[g]) : Unpack(packed_nodes(g));
+  }
+  Surfel surfel(uint32_t slot) const {
+    const PackedSurfels& s = surfels_[slot / kLanes];
+    const uint32_t k = slot % kLanes;
+    return {CentreIn(s.frame, s.x[k], s.y[k], s.z[k]), UnpackNormal(s.normal[k]),
+            HalfToFloat(s.radius[k]) * s.frame.unit};
+  }
+  RadianceSides radiance_of(uint32_t slot) const {
+    const PackedRadiance& r = radiance_[slot / kLanes];
+    const uint32_t k = slot % kLanes;
+    return {unit_.Unpack(r.front[k]), unit_.Unpack(r.back[k])};
+  }
+  Rgb radiance_of(uint32_t slot, bool front) const {
+    const PackedRadiance& r = radiance_[slot / kLanes];
+    return unit_.Unpack((front ? r.front : r.back)[slot % kLanes]);
+  }
+  RadianceGroup radiance(uint32_t g) const {
+    RadianceGroup sides;
+    for (uint32_t k = 0; k < kLanes; ++k) sides.lane[k] = radiance_of(g * kLanes + k);
+    return sides;
+  }
   // Whether any surfel reflects anything.
   bool lit() const { return lit_; }
   size_t size_bytes() const {
-    return topology_.size() + radiance_blob_.size() + own_groups_.size() * sizeof(NodeGroup);
+    return topology_.size() + radiance_blob_.size() + own_surfels_.size() * sizeof(PackedSurfels) +
+           own_nodes_.size() * sizeof(PackedNodes);
   }
 
  private:
@@ -108,17 +133,23 @@ class PointTree {
   absl::Status AddVisible(std::span<const uint32_t> lit_sides);
 
   Blob topology_, radiance_blob_;
-  AlignedVector<NodeGroup> own_groups_;  // if they differ from the blob's
+  // If they differ from the blob's.
+  AlignedVector<PackedSurfels> own_surfels_;
+  AlignedVector<PackedNodes> own_nodes_;
   uint64_t surfel_count_ = 0, node_count_ = 0;
-  std::vector<uint32_t> first_group_;  // by level
-  std::span<const NodeGroup> groups_;
-  std::span<const RadianceGroup> radiance_;
+  std::vector<uint32_t> first_group_;       // by level
+  std::span<const PackedSurfels> surfels_;  // groups of level 0
+  std::span<const PackedNodes> nodes_;      // of the others
+  std::span<const PackedRadiance> radiance_;
+  RadianceUnit unit_;
   bool lit_ = false;
 };
 
 // The class (0..5) and the position along the Hilbert curve by which surfels are sorted; x, y, z
 // in [0, 2^16). Skilling, "Programming the Hilbert curve", 2004.
 uint64_t HilbertIndex(uint32_t x, uint32_t y, uint32_t z);
+// Of eight points at once.
+std::array<uint64_t, kLanes> HilbertIndex8(U8 x, U8 y, U8 z);
 unsigned NormalClass(const Vec3f& n);
 
 }  // namespace farpoint

@@ -7,6 +7,7 @@
 #include <cstdlib>
 #include <limits>
 
+#include "core/math/elementary.h"
 #include "core/math/sampling.h"
 
 namespace farpoint {
@@ -33,14 +34,12 @@ uint64_t KeyOf(int64_t x, int64_t y, int64_t z) {
 SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
   if (tree.empty()) return;
   const uint64_t n = tree.surfel_count();
-  const uint32_t first = tree.first_group(0);
   double area = 0;
   Box3f box;
   for (uint64_t i = 0; i < n; ++i) {
-    const NodeGroup& g = tree.group(first + static_cast<uint32_t>(i / kLanes));
-    const unsigned k = i % kLanes;
-    area += static_cast<double>(g.area[k]);
-    box.Extend({g.cx[k], g.cy[k], g.cz[k]});
+    const Surfel s = tree.surfel(static_cast<uint32_t>(i));
+    area += kPi * static_cast<double>(s.radius_m) * static_cast<double>(s.radius_m);
+    box.Extend(s.position);
   }
   spacing_m_ = static_cast<float>(std::sqrt(area / static_cast<double>(n)));
   // At most 2^20 cells along an axis, so that keys fit.
@@ -54,9 +53,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
   };
   std::vector<Keyed> order(n);
   for (uint64_t i = 0; i < n; ++i) {
-    const NodeGroup& g = tree.group(first + static_cast<uint32_t>(i / kLanes));
-    const unsigned k = i % kLanes;
-    const Vec3f q = (Vec3f(g.cx[k], g.cy[k], g.cz[k]) - low_) * inverse_cell_;
+    const Vec3f q = (tree.surfel(static_cast<uint32_t>(i)).position - low_) * inverse_cell_;
     order[i] = {
         KeyOf(static_cast<int64_t>(q.x), static_cast<int64_t>(q.y), static_cast<int64_t>(q.z)),
         static_cast<uint32_t>(i)};
@@ -72,9 +69,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
     uint64_t end = i;
     while (end < n && order[end].key == order[i].key) {
       const uint32_t slot = order[end].slot;
-      const NodeGroup& g = tree.group(first + slot / kLanes);
-      const unsigned k = slot % kLanes;
-      entries_[end] = {{g.cx[k], g.cy[k], g.cz[k]}, slot};
+      entries_[end] = {tree.surfel(slot).position, slot};
       ++end;
     }
     size_t at = Mix64(order[i].key) & (size - 1);
@@ -103,7 +98,6 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
   if (x0 < 0 || y0 < 0 || z0 < 0 || x0 >= 1 << 20 || y0 >= 1 << 20 || z0 >= 1 << 20) {
     return std::nullopt;
   }
-  const uint32_t first = tree_.first_group(0);
   // Surfels that are wound as the surface is come first: on the far side of a thin board, and where
   // two objects touch, there are others as near, whose backs are inside.
   const float farthest = spacing_m_ * spacing_m_ * 2.25f;
@@ -121,18 +115,15 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
       const float d2 = Length2(entries_[e].position - p);
       if (!(d2 < farthest)) continue;
       const uint32_t slot = entries_[e].slot;
-      const NodeGroup& g = tree_.group(first + slot / kLanes);
-      const unsigned k = slot % kLanes;
-      const float cosine = g.nx[k] * n.x + g.ny[k] * n.y + g.nz[k] * n.z;
+      const Vec3f m = tree_.surfel(slot).normal;
+      const float cosine = m.x * n.x + m.y * n.y + m.z * n.z;
       if (!(std::fabs(cosine) > kSameSurfaceCosine)) continue;
       const Vec3f d = p - entries_[e].position;
-      const float off = g.nx[k] * d.x + g.ny[k] * d.y + g.nz[k] * d.z;
+      const float off = m.x * d.x + m.y * d.y + m.z * d.z;
       if (!(std::fabs(off) <= kSamePlane * spacing_m_)) continue;
       const int turned = cosine > 0.0f ? 0 : 1;
       if (d2 < spacing_m_ * spacing_m_) {
-        const RadianceGroup::Sides& sides =
-            tree_.radiance(first + slot / kLanes).lane[slot % kLanes];
-        const Rgb& l = front == (turned == 0) ? sides.front : sides.back;
+        const Rgb l = tree_.radiance_of(slot, front == (turned == 0));
         const float sum = l.x + l.y + l.z;
         darkest[turned] = std::min(darkest[turned], sum);
         brightest[turned] = std::max(brightest[turned], sum);
@@ -147,9 +138,7 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
   if (found[turned] == ~0u) return std::nullopt;
   if (darkest[turned] < kLeastContrast * brightest[turned]) return std::nullopt;
   if (where != nullptr) *where = place[turned];
-  const uint32_t slot = found[turned];
-  const RadianceGroup::Sides& sides = tree_.radiance(first + slot / kLanes).lane[slot % kLanes];
-  return front == (turned == 0) ? sides.front : sides.back;
+  return tree_.radiance_of(found[turned], front == (turned == 0));
 }
 
 namespace {

@@ -3,18 +3,19 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <cstddef>
+#include <type_traits>
 
 #include "core/base/check.h"
 #include "core/math/elementary.h"
 #include "core/math/simd8.h"
+#include "core/math/vec8.h"
+#include "core/pbgi/packed_nodes.h"
 
 namespace farpoint {
 
 namespace {
 
-// Below this squared length of the mean normal a node's surfels look in such different directions
-// that it is no disc at any distance: descend.
-constexpr float kMinCoherence2 = 0.5f;
 // Discs whose plane passes within this part of their radius of the receiver, with agreeing
 // normals, are the receiver's own surface seen through its curvature or folds.
 constexpr float kSelfPlaneFactor = 0.6f;
@@ -22,59 +23,22 @@ constexpr float kSelfNormalCosine = 0.5f;
 // Pixels of the cosine map grow towards the horizon; their growth counts up to here.
 constexpr float kMinZenithCosine = 0.1f;
 
-// Eight lanes' verdicts as bit masks.
-struct Verdict {
-  unsigned splat = 0;  // take the node as it is
-  unsigned descend = 0;
-  unsigned near = 0;        // stop here, receivers go on
-  F8 dx, dy, dz, distance;  // from the view to the centre
-  F8 facing;                // mean normal · (dx, dy, dz)
-};
-
-// Appends the lanes of `mask` to the cut.
-void Append(const NodeGroup& g, const Verdict& verdict, unsigned mask, bool sees_inside,
-            const uint32_t* slots, uint32_t first_slot, std::vector<CutNode>& cut) {
-  const F8 zero = Set8(0.0f);
-  const F8 inverse = Set8(1.0f) / verdict.distance;
-  const F8 front_area = Load8(g.front_area), back_area = Load8(g.back_area);
-  const M8 front = verdict.facing < zero;
-  F8 area = Select8(front, front_area, back_area);
-  if (sees_inside) area = Max8(front_area, back_area);
-  // |facing| / d is the cosine; the sign of the result tells the side.
-  const F8 omega = -verdict.facing * area * inverse * inverse * inverse;
-  alignas(32) float w[5][8];
-  Store8(w[0], verdict.dx * inverse);
-  Store8(w[1], verdict.dy * inverse);
-  Store8(w[2], verdict.dz * inverse);
-  Store8(w[3], verdict.distance);
-  Store8(w[4], omega);
-  for (; mask != 0; mask &= mask - 1) {
-    const int k = std::countr_zero(mask);
-    // A node exactly at the view has no direction.
-    if (!(w[3][k] > 0.0f)) continue;
-    const uint32_t slot = slots != nullptr ? slots[k] : first_slot + static_cast<uint32_t>(k);
-    cut.push_back({slot, w[3][k], {w[0][k], w[1][k], w[2][k]}, w[4][k]});
-  }
-}
-
-// View and parameters, spread to eight lanes.
+// View and parameters, spread to eight lanes. Lengths in metres.
 struct LaneView {
-  F8 px, py, pz, nx, ny, nz;
-  F8 radius, epsilon, sin_spread, cos_spread, margin, size_limit, zero;
+  Vec3f position;
+  float radius_m, margin_m;
+  V8 normal;
+  F8 epsilon, sin_spread, cos_spread, size_limit, zero;
   bool flat, everything_visible_above, sees_inside, cosine_map, sharing;
 
   LaneView(const CutView& view, const CutParams& params, bool want_near)
-      : px(Set8(view.position.x)),
-        py(Set8(view.position.y)),
-        pz(Set8(view.position.z)),
-        nx(Set8(view.normal.x)),
-        ny(Set8(view.normal.y)),
-        nz(Set8(view.normal.z)),
-        radius(Set8(view.radius_m)),
+      : position(view.position),
+        radius_m(view.radius_m),
+        margin_m(view.margin_m),
+        normal(view.normal),
         epsilon(Set8(params.epsilon)),
         sin_spread(Set8(view.sin_spread)),
         cos_spread(Set8(view.cos_spread)),
-        margin(Set8(view.margin_m)),
         size_limit(Set8(params.pixel_sr * kCutPixels * kInvPif)),
         zero(Set8(0)),
         flat(view.sin_spread == 0.0f),
@@ -84,88 +48,237 @@ struct LaneView {
         sharing(want_near) {}
 };
 
-Verdict Judge(const NodeGroup& g, const LaneView& v, bool leaf, CutCounters& counters) {
-  const F8 dx = Load8(g.cx) - v.px;
-  const F8 dy = Load8(g.cy) - v.py;
-  const F8 dz = Load8(g.cz) - v.pz;
-  const F8 r = Load8(g.radius);
-  const F8 mx = Load8(g.nx), my = Load8(g.ny), mz = Load8(g.nz);
-  const F8 d2 = dx * dx + dy * dy + dz * dz;
+// 1 / unit, of a power of two, without a division.
+inline float InverseOfPower(float unit) {
+  return std::bit_cast<float>((254u << 23) - std::bit_cast<uint32_t>(unit));
+}
+
+// Eight nodes as they are stored: lengths are in a unit of the group's own, a power of two, in
+// which a view compares them as they are; all rules are of ratios. Fields are read where they are
+// needed.
+template <typename Packed>
+class StoredLanes {
+ public:
+  StoredLanes(const Packed& g, const LaneView& v)
+      : g_(g), normal_(g.normal), inverse_unit_(InverseOfPower(g.frame.unit)) {
+    const auto from_view = [&](const uint16_t* steps, int axis, float view) {
+      return LoadWholes(steps) + Set8((g.frame.origin[axis] - view) * inverse_unit_);
+    };
+    offset_ = {from_view(g.x, 0, v.position.x), from_view(g.y, 1, v.position.y),
+               from_view(g.z, 2, v.position.z)};
+  }
+  const V8& offset() const { return offset_; }  // from the view to the centre
+  float unit_m() const { return g_.frame.unit; }
+  float inverse_unit() const { return inverse_unit_; }
+  F8 radius() const { return LoadHalves(g_.radius); }  // < 0: empty slot
+  // The mean normal is `normal_steps` times `normal_step`.
+  const V8& normal_steps() const { return normal_.steps; }
+  F8 normal_step() const { return Set8(kInverseNormalSteps); }
+  // Bit k: that side of lane k is visible.
+  unsigned front() const { return normal_.front(); }
+  unsigned back() const { return normal_.back(); }
+  // Of inner nodes.
+  F8 thickness() const { return LoadHalves(g_.thickness); }
+  F8 sin_cone() const { return LoadHalves(g_.sin_cone); }
+  F8 inverse_length() const { return Abs8(LoadHalves(g_.inverse_length)); }
+  unsigned scattered() const {  // bit k: no disc at any distance (kMinCoherence2)
+    const auto signs = _mm_load_si128(reinterpret_cast<const __m128i*>(g_.inverse_length));
+    return static_cast<unsigned>(_mm_movemask_epi8(_mm_packs_epi16(signs, signs))) & 0xffu;
+  }
+  // Visible areas in squared units.
+  F8 front_area() const {
+    if constexpr (std::is_same_v<Packed, PackedSurfels>) {
+      return Select8(normal_.word << 1 < 0, DiscArea(radius()), Set8(0.0f));
+    } else {
+      return LoadHalves(g_.front_area) * Set8(kAreaUnits);
+    }
+  }
+  F8 back_area() const {
+    if constexpr (std::is_same_v<Packed, PackedSurfels>) {
+      return Select8(normal_.word, DiscArea(radius()), Set8(0.0f));
+    } else {
+      return LoadHalves(g_.back_area) * Set8(kAreaUnits);
+    }
+  }
+
+ private:
+  const Packed& g_;
+  NormalLanes normal_;
+  float inverse_unit_;
+  V8 offset_;
+};
+
+// The same of nodes that are unpacked: in metres.
+class UnpackedLanes {
+ public:
+  UnpackedLanes(const NodeGroup& g, const LaneView& v)
+      : g_(g),
+        offset_(Load8(g.cx) - Set8(v.position.x), Load8(g.cy) - Set8(v.position.y),
+                Load8(g.cz) - Set8(v.position.z)),
+        normal_(Load8(g.nx), Load8(g.ny), Load8(g.nz)) {}
+  const V8& offset() const { return offset_; }
+  float unit_m() const { return 1.0f; }
+  float inverse_unit() const { return 1.0f; }
+  F8 radius() const { return Load8(g_.radius); }
+  const V8& normal_steps() const { return normal_; }
+  F8 normal_step() const { return Set8(1.0f); }
+  unsigned front() const { return Bits8(front_area() > Set8(0.0f)); }
+  unsigned back() const { return Bits8(back_area() > Set8(0.0f)); }
+  F8 thickness() const { return Load8(g_.thickness); }
+  F8 sin_cone() const { return Load8(g_.sin_cone); }
+  F8 inverse_length() const { return Load8(g_.inverse_length); }
+  unsigned scattered() const { return Bits8(Dot(normal_, normal_) < Set8(kMinCoherence2)); }
+  F8 front_area() const { return Load8(g_.front_area); }
+  F8 back_area() const { return Load8(g_.back_area); }
+
+ private:
+  const NodeGroup& g_;
+  V8 offset_, normal_;
+};
+
+// Eight lanes' verdicts as bit masks.
+struct Verdict {
+  unsigned splat = 0;  // take the node as it is
+  unsigned descend = 0;
+  unsigned near = 0;  // stop here, receivers go on
+  F8 distance;        // in units of the lanes
+  F8 facing;          // mean normal · offset; < 0: its front looks at the view
+};
+
+// Columns of eight become rows of eight.
+inline void Transpose8(__m256 (&m)[8]) {
+  __m256 t[8], u[8];
+  for (int i = 0; i < 8; i += 2) {
+    t[i] = _mm256_unpacklo_ps(m[i], m[i + 1]);
+    t[i + 1] = _mm256_unpackhi_ps(m[i], m[i + 1]);
+  }
+  for (int i = 0; i < 8; i += 4) {
+    u[i] = _mm256_shuffle_ps(t[i], t[i + 2], 0x44);
+    u[i + 1] = _mm256_shuffle_ps(t[i], t[i + 2], 0xee);
+    u[i + 2] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0x44);
+    u[i + 3] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0xee);
+  }
+  for (int i = 0; i < 4; ++i) {
+    m[i] = _mm256_permute2f128_ps(u[i], u[i + 4], 0x20);
+    m[i + 4] = _mm256_permute2f128_ps(u[i], u[i + 4], 0x31);
+  }
+}
+
+// Appends the lanes of `mask`, not empty, to the cut; those of `slots`.
+template <typename Lanes>
+inline void Append(const Lanes& n, const Verdict& verdict, unsigned mask, bool sees_inside,
+                   U8 slots, std::vector<CutNode>& cut) {
+  // A node exactly at the view has no direction.
+  mask &= Bits8(verdict.distance > Set8(0.0f));
+  const F8 inverse = Set8(1.0f) / verdict.distance;
+  const F8 front_area = n.front_area(), back_area = n.back_area();
+  F8 area = Select8(reinterpret_cast<M8>(verdict.facing), front_area, back_area);
+  if (sees_inside) area = Max8(front_area, back_area);
+  // |facing| / d is the cosine; the sign of the result tells the side.
+  const F8 omega = -verdict.facing * area * inverse * inverse * inverse;
+  const auto row = [](F8 v) { return reinterpret_cast<__m256>(v); };
+  static_assert(sizeof(CutNode) == 6 * sizeof(float) && offsetof(CutNode, distance_m) == 4 &&
+                offsetof(CutNode, direction) == 8 && offsetof(CutNode, signed_solid_angle) == 20);
+  __m256 nodes[8] = {row(reinterpret_cast<F8>(slots)),
+                     row(verdict.distance * Set8(n.unit_m())),
+                     row(n.offset().x * inverse),
+                     row(n.offset().y * inverse),
+                     row(n.offset().z * inverse),
+                     row(omega),
+                     _mm256_setzero_ps(),
+                     _mm256_setzero_ps()};
+  Transpose8(nodes);
+  // Whole rows are written, each over the end of the one before it: room for one more.
+  const size_t size = cut.size(), count = static_cast<size_t>(std::popcount(mask));
+  cut.resize(size + count + 1);
+  CutNode* out = cut.data() + size;
+  for (uint32_t k = 0; k < kLanes; ++k) {
+    if ((mask >> k & 1u) == 0) continue;
+    _mm256_storeu_ps(reinterpret_cast<float*>(out++), nodes[k]);
+  }
+  cut.resize(size + count);
+}
+
+template <bool kLeaf, typename Lanes>
+inline Verdict Judge(const Lanes& n, const LaneView& v, CutCounters& counters) {
+  const F8 one = Set8(1.0f), step = n.normal_step();
+  const V8 offset = n.offset();
+  const F8 r = n.radius();
+  const F8 d2 = Dot(offset, offset);
   const F8 d = Sqrt8(d2);
-  const F8 height = v.nx * dx + v.ny * dy + v.nz * dz;  // above the view's horizon plane
-  const F8 facing = mx * dx + my * dy + mz * dz;        // < 0: its front looks at the view
-  const F8 n_dot_m = v.nx * mx + v.ny * my + v.nz * mz;
-  const F8 one = Set8(1.0f);
-  const M8 used = r >= v.zero;
+  const F8 height = Dot(v.normal, offset);  // above the view's horizon plane
+  const F8 facing = Dot(n.normal_steps(), offset) * step;
+  const F8 n_dot_m = Dot(v.normal, n.normal_steps()) * step;
+  const F8 radius = Set8(v.radius_m * n.inverse_unit());
 
   // How far the node reaches beyond its centre towards the normal(s): a flat node's discs lie in a
   // slab, which is much thinner than its sphere.
-  const F8 tilt = Sqrt8(Max8(one - n_dot_m * n_dot_m, v.zero));
-  F8 reach, top;
-  if (v.flat) {
-    reach = Min8(r, r * tilt + Load8(g.thickness));
-    top = height + reach + v.margin;
-  } else {
-    reach = Min8(r, r * Min8(one, tilt + v.sin_spread) + Load8(g.thickness));
-    // max over the cone of normals of n·(c - p): |v| if the direction lies in the cone.
-    const F8 lateral = Sqrt8(Max8(d2 - height * height, v.zero));
-    const F8 turned = height * v.cos_spread + lateral * v.sin_spread;
-    top = Select8(height >= d * v.cos_spread, d, turned) + reach + v.margin;
-  }
-  M8 alive = used;
+  unsigned alive = Bits8(r >= v.zero);
   if (!v.everything_visible_above) {
-    const M8 above = top > v.zero;
-    counters.below_horizon += std::popcount(Bits8(used & ~above));
+    const F8 tilt = Sqrt8(Max8(one - n_dot_m * n_dot_m, v.zero));
+    const F8 turn = v.flat ? tilt : Min8(one, tilt + v.sin_spread);
+    F8 reach = r * turn;
+    if constexpr (!kLeaf) reach = Min8(r, reach + n.thickness());
+    F8 top = height;
+    if (!v.flat) {
+      // max over the cone of normals of n·(c - p): |v| if the direction lies in the cone.
+      const F8 lateral = Sqrt8(Max8(d2 - height * height, v.zero));
+      const F8 turned = height * v.cos_spread + lateral * v.sin_spread;
+      top = Select8(height >= d * v.cos_spread, d, turned);
+    }
+    const F8 margin = Set8(v.margin_m * n.inverse_unit());
+    const F8 least = Max8(d - r, v.zero) * Set8(kHorizonSine);
+    const unsigned above = Bits8(top + reach + margin > least);
+    counters.below_horizon += static_cast<unsigned>(std::popcount(alive & ~above));
     alive &= above;
   }
 
   // Every disc turns the same side to every receiver, and that side cannot be seen.
-  const F8 front_area = Load8(g.front_area), back_area = Load8(g.back_area);
-  const F8 seen_front = v.sees_inside ? Max8(front_area, back_area) : front_area;
-  const F8 seen_back = v.sees_inside ? Max8(front_area, back_area) : back_area;
-  const F8 mean_length2 = mx * mx + my * my + mz * mz;
-  {
-    const F8 unit_facing = facing / Sqrt8(Max8(mean_length2, Set8(1e-30f)));
-    const F8 slack = d * Load8(g.sin_cone) + r + v.radius;
-    const M8 all_front = -unit_facing > slack;
-    const M8 all_back = unit_facing > slack;
-    const M8 invisible = (all_front & (seen_front <= v.zero)) | (all_back & (seen_back <= v.zero)) |
-                         ((seen_front <= v.zero) & (seen_back <= v.zero));
-    counters.invisible_side += std::popcount(Bits8(alive & invisible));
+  const unsigned front = n.front(), back = n.back();
+  const unsigned seen_front = v.sees_inside ? front | back : front;
+  const unsigned seen_back = v.sees_inside ? front | back : back;
+  if ((alive & ~(seen_front & seen_back)) != 0) {
+    F8 unit_facing = facing, slack = r + radius;
+    if constexpr (!kLeaf) {
+      unit_facing = facing * n.inverse_length();
+      slack = d * n.sin_cone() + slack;
+    }
+    const unsigned all_front = Bits8(-unit_facing > slack);
+    const unsigned all_back = Bits8(unit_facing > slack);
+    const unsigned invisible =
+        (all_front & ~seen_front) | (all_back & ~seen_back) | ~(seen_front | seen_back);
+    counters.invisible_side += static_cast<unsigned>(std::popcount(alive & invisible));
     alive &= ~invisible;
   }
 
   Verdict out;
   out.distance = d;
-  out.dx = dx;
-  out.dy = dy;
-  out.dz = dz;
   out.facing = facing;
-  // pi r² / d² against the pixel's solid angle.
-  F8 limit = v.size_limit * d2;
-  if (v.cosine_map) {
-    const F8 zenith = Max8(height / Max8(d, Set8(1e-30f)), Set8(kMinZenithCosine));
-    limit = limit / zenith;
-  }
-  const M8 coarse = (r * r > limit) | (mean_length2 < Set8(kMinCoherence2));
-  M8 far = alive, near = alive & ~alive;
+  unsigned far = alive, near = 0;
   if (v.sharing) {
-    far = alive & (v.radius < v.epsilon * (d - r));
-    near = alive & (v.radius >= v.epsilon * (d + r));
+    far = alive & Bits8(radius < v.epsilon * (d - r));
+    near = alive & Bits8(radius >= v.epsilon * (d + r));
   }
-  if (leaf) {
+  if constexpr (kLeaf) {
     // A surfel that straddles the border between near and far is near, too.
-    near = v.sharing ? (alive & ~far) : near;
-    const M8 own_surface =
-        (Abs8(facing) < Set8(kSelfPlaneFactor) * r) & (Abs8(n_dot_m) > Set8(kSelfNormalCosine));
-    out.splat = Bits8(far & ~own_surface);
-    out.near = Bits8(near);
+    if (v.sharing) near = alive & ~far;
+    const unsigned own_surface = Bits8((Abs8(facing) < Set8(kSelfPlaneFactor) * r) &
+                                       (Abs8(n_dot_m) > Set8(kSelfNormalCosine)));
+    out.splat = far & ~own_surface;
+    out.near = near;
   } else {
+    // pi r² / d² against the pixel's solid angle.
+    F8 limit = v.size_limit * d2;
+    if (v.cosine_map) {
+      const F8 zenith = Max8(height / Max8(d, Set8(1e-30f)), Set8(kMinZenithCosine));
+      limit = limit / zenith;
+    }
+    const unsigned coarse = Bits8(r * r > limit) | n.scattered();
     // Descending a node that is fine enough would cut it finer than a receiver alone does.
     if (v.sharing) near |= alive & ~far & ~coarse;
-    out.splat = Bits8(far & ~coarse);
-    out.near = Bits8(near);
-    out.descend = Bits8(alive & ~near & ~(far & ~coarse));
+    out.splat = far & ~coarse;
+    out.near = near;
+    out.descend = alive & ~near & ~out.splat;
   }
   return out;
 }
@@ -178,27 +291,43 @@ struct Pending {
 // 8-ary, at most 12 levels for 2^31 surfels, up to seven siblings wait on each.
 constexpr int kMaxPending = 8 * 13;
 
+void Prefetch(const PointTree& tree, uint32_t group, int level) {
+  const auto* bytes = level == 0 ? reinterpret_cast<const char*>(&tree.packed_surfels(group))
+                                 : reinterpret_cast<const char*>(&tree.packed_nodes(group));
+  _mm_prefetch(bytes, _MM_HINT_T0);
+  _mm_prefetch(bytes + 64, _MM_HINT_T0);
+}
+
 void Descend(const PointTree& tree, const LaneView& lanes, Pending first, std::vector<CutNode>& far,
              std::vector<NearNode>* near, CutCounters& counters) {
   Pending stack[kMaxPending];
   int size = 0;
   stack[size++] = first;
-  while (size > 0) {
-    const Pending at = stack[--size];
-    ++counters.groups_visited;
-    const Verdict verdict = Judge(tree.group(at.group), lanes, at.level == 0, counters);
+  const U8 iota = {0, 1, 2, 3, 4, 5, 6, 7};
+  const auto visit = [&]<typename Packed>(const Packed& group, const Pending& at) {
+    const StoredLanes<Packed> nodes(group, lanes);
+    const Verdict verdict = Judge<std::is_same_v<Packed, PackedSurfels>>(nodes, lanes, counters);
     if (verdict.splat != 0) {
-      Append(tree.group(at.group), verdict, verdict.splat, lanes.sees_inside, nullptr,
-             at.group * kLanes, far);
+      Append(nodes, verdict, verdict.splat, lanes.sees_inside, iota + at.group * kLanes, far);
     }
     for (unsigned m = verdict.near; m != 0; m &= m - 1) {
       near->push_back({at.group * kLanes + static_cast<uint32_t>(std::countr_zero(m)), at.level});
     }
-    for (unsigned m = verdict.descend; m != 0; m &= m - 1) {
+    return verdict.descend;
+  };
+  while (size > 0) {
+    const Pending at = stack[--size];
+    ++counters.groups_visited;
+    if (at.level == 0) {
+      visit(tree.packed_surfels(at.group), at);
+      continue;
+    }
+    const unsigned descend = visit(tree.packed_nodes(at.group), at);
+    for (unsigned m = descend; m != 0; m &= m - 1) {
       const uint32_t slot = at.group * kLanes + static_cast<uint32_t>(std::countr_zero(m));
       FP_DCHECK(size < kMaxPending);
       const uint32_t child = tree.ChildGroup(at.level, slot);
-      _mm_prefetch(reinterpret_cast<const char*>(&tree.group(child)), _MM_HINT_T0);
+      Prefetch(tree, child, at.level - 1);
       stack[size++] = {child, at.level - 1};
     }
   }
@@ -214,6 +343,25 @@ void ComputeClusterCut(const PointTree& tree, const CutView& view, const CutPara
   Descend(tree, lanes, {tree.root_group(), tree.root_level()}, far, near, counters);
 }
 
+namespace {
+
+void CopyLane(const NodeGroup& from, uint32_t lane, NodeGroup& to, uint32_t at) {
+  to.cx[at] = from.cx[lane];
+  to.cy[at] = from.cy[lane];
+  to.cz[at] = from.cz[lane];
+  to.radius[at] = from.radius[lane];
+  to.thickness[at] = from.thickness[lane];
+  to.nx[at] = from.nx[lane];
+  to.ny[at] = from.ny[lane];
+  to.nz[at] = from.nz[lane];
+  to.sin_cone[at] = from.sin_cone[lane];
+  to.inverse_length[at] = from.inverse_length[lane];
+  to.front_area[at] = from.front_area[lane];
+  to.back_area[at] = from.back_area[lane];
+}
+
+}  // namespace
+
 void PackedNearNodes::Pack(const PointTree& tree, std::span<const NearNode> near) {
   nodes.assign(near.begin(), near.end());
   // Surfels first, so that a group is all surfels or judged as inner nodes (each lane's level is
@@ -227,31 +375,17 @@ void PackedNearNodes::Pack(const PointTree& tree, std::span<const NearNode> near
   const size_t padded_leaves = (leaves + kLanes - 1) / kLanes * kLanes;
   nodes.insert(nodes.begin() + static_cast<std::ptrdiff_t>(leaves), padded_leaves - leaves,
                NearNode{~0u, 0});
+  NodeGroup empty{};
+  empty.radius[0] = -1;
   groups.resize((nodes.size() + kLanes - 1) / kLanes);
   for (size_t i = 0; i < groups.size() * kLanes; ++i) {
     NodeGroup& g = groups[i / kLanes];
     const uint32_t k = i % kLanes;
     if (i >= nodes.size() || nodes[i].slot == ~0u) {
-      g.cx[k] = g.cy[k] = g.cz[k] = 0;
-      g.radius[k] = -1;
-      g.thickness[k] = g.nx[k] = g.ny[k] = g.nz[k] = g.sin_cone[k] = 0;
-      g.area[k] = g.front_area[k] = g.back_area[k] = 0;
-      continue;
+      CopyLane(empty, 0, g, k);
+    } else {
+      CopyLane(tree.group(nodes[i].slot / kLanes), nodes[i].slot % kLanes, g, k);
     }
-    const NodeGroup& from = tree.group(nodes[i].slot / kLanes);
-    const uint32_t s = nodes[i].slot % kLanes;
-    g.cx[k] = from.cx[s];
-    g.cy[k] = from.cy[s];
-    g.cz[k] = from.cz[s];
-    g.radius[k] = from.radius[s];
-    g.thickness[k] = from.thickness[s];
-    g.nx[k] = from.nx[s];
-    g.ny[k] = from.ny[s];
-    g.nz[k] = from.nz[s];
-    g.sin_cone[k] = from.sin_cone[s];
-    g.area[k] = from.area[s];
-    g.front_area[k] = from.front_area[s];
-    g.back_area[k] = from.back_area[s];
   }
 }
 
@@ -262,13 +396,15 @@ void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutPar
   for (size_t gi = 0; gi < near.groups.size(); ++gi) {
     const bool leaf = near.nodes[gi * kLanes].level == 0;
     ++counters.groups_visited;
-    const Verdict verdict = Judge(near.groups[gi], lanes, leaf, counters);
+    const UnpackedLanes nodes(near.groups[gi], lanes);
+    const Verdict verdict =
+        leaf ? Judge<true>(nodes, lanes, counters) : Judge<false>(nodes, lanes, counters);
     if (verdict.splat != 0) {
-      uint32_t slots[kLanes] = {};
+      U8 slots = {};
       for (uint32_t k = 0; k < kLanes && gi * kLanes + k < near.nodes.size(); ++k) {
         slots[k] = near.nodes[gi * kLanes + k].slot;
       }
-      Append(near.groups[gi], verdict, verdict.splat, lanes.sees_inside, slots, 0, cut);
+      Append(nodes, verdict, verdict.splat, lanes.sees_inside, slots, cut);
     }
     for (unsigned m = verdict.descend; m != 0; m &= m - 1) {
       const NearNode& n = near.nodes[gi * kLanes + std::countr_zero(m)];

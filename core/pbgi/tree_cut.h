@@ -29,6 +29,10 @@ struct CutView {
 };
 
 inline constexpr float kCutPixels = 4.0f;
+// What rises above the horizon by no more than this sine is culled: quantised normals do not tell
+// it from the plane that the receiver lies in. A ring of that height has its square, 4e-6, of the
+// cosine-weighted hemisphere.
+inline constexpr float kHorizonSine = 0x1p-9f;
 
 // When to descend.
 struct CutParams {

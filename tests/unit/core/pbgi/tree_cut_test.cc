@@ -90,7 +90,7 @@ TEST(TreeCut, HoldsEverySurfelOnce) {
   std::vector<NearNode> near;
   CutCounters counters;
   ComputeClusterCut(*tree, view, params, far, &near, counters);
-  std::vector<int> count(tree->groups().size() * kLanes, 0);
+  std::vector<int> count(tree->group_count() * kLanes, 0);
   for (const CutNode& n : far) CountBelow(*tree, LevelOf(*tree, n.slot), n.slot, count);
   for (const NearNode& n : near) CountBelow(*tree, n.level, n.slot, count);
   int missing = 0;
@@ -122,7 +122,7 @@ TEST(TreeCut, FarIsBeyondNear) {
       EXPECT_LT(view.radius_m, params.epsilon * (n.distance_m - r) * 1.00001f);
     }
     for (const NearNode& n : near) {
-      const NodeGroup& g = tree->group(n.slot / kLanes);
+      const NodeGroup g = tree->group(n.slot / kLanes);
       const uint32_t k = n.slot % kLanes;
       const float d = Length(Vec3f(g.cx[k], g.cy[k], g.cz[k]) - view.position);
       // Wholly near, or one that straddles the border and needs no descent.
@@ -152,7 +152,7 @@ TEST(TreeCut, EpsilonZeroSharesNothingAndInfinityAll) {
   ComputeClusterCut(*tree, view, params, far, &near, counters);
   EXPECT_FALSE(far.empty());
   for (const NearNode& n : near) {  // only what encloses the active receiver
-    const NodeGroup& g = tree->group(n.slot / kLanes);
+    const NodeGroup g = tree->group(n.slot / kLanes);
     const uint32_t k = n.slot % kLanes;
     EXPECT_LE(Length(Vec3f(g.cx[k], g.cy[k], g.cz[k]) - view.position), g.radius[k] * 1.0001f);
   }

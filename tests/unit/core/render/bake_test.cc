@@ -274,8 +274,11 @@ TEST(Bake, ALightWithinAClosedObjectKeepsTheTopology) {
     const auto tree =
         PointTree::FromBlobs(baked.blobs.tree_topology, baked.blobs.tree_radiance).value();
     double area = 0;
-    const NodeGroup& root = tree->group(tree->root_group());
-    for (uint32_t k = 0; k < kLanes; ++k) area += root.front_area[k] + root.back_area[k];
+    const uint32_t groups = tree->levels() > 1 ? tree->first_group(1) : tree->group_count();
+    for (uint32_t g = 0; g < groups; ++g) {
+      const NodeGroup surfels = tree->group(g);
+      for (uint32_t k = 0; k < kLanes; ++k) area += surfels.front_area[k] + surfels.back_area[k];
+    }
     return area;
   };
   // Six squares of 0.2 m.
