@@ -35,6 +35,14 @@ Blob Blob::FromAligned(AlignedVector<std::byte> bytes) {
   return blob;
 }
 
+Blob Blob::FromBulk(BulkVector<std::byte> bytes) {
+  auto owner = std::make_shared<const BulkVector<std::byte>>(std::move(bytes));
+  Blob blob;
+  blob.bytes_ = *owner;
+  blob.owner_ = std::move(owner);
+  return blob;
+}
+
 Blob Blob::FromString(std::string_view bytes) {
   const auto view = std::as_bytes(std::span(bytes.data(), bytes.size()));
   return FromAligned(AlignedVector<std::byte>(view.begin(), view.end()));

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "core/base/aligned.h"
+#include "core/base/bulk_vector.h"
 #include "core/base/hash.h"
 #include "core/base/status.h"
 
@@ -21,6 +22,7 @@ class Blob {
   Blob() = default;
 
   static Blob FromAligned(AlignedVector<std::byte> bytes);  // no copy
+  static Blob FromBulk(BulkVector<std::byte> bytes);        // no copy
   static Blob FromVector(const std::vector<std::byte>& bytes) {
     return FromAligned(AlignedVector<std::byte>(bytes.begin(), bytes.end()));
   }

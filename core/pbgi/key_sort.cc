@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <vector>
 
 namespace farpoint {
 
@@ -15,7 +16,7 @@ constexpr size_t kSmall = 4096;
 
 }  // namespace
 
-void SortByKey(std::vector<KeyedIndex>& items, Executor& executor) {
+void SortByKey(BulkVector<KeyedIndex>& items, Executor& executor) {
   const size_t n = items.size();
   if (n <= kSmall) {
     std::stable_sort(items.begin(), items.end(),
@@ -32,7 +33,7 @@ void SortByKey(std::vector<KeyedIndex>& items, Executor& executor) {
   uint64_t differing = 0;
   for (const uint64_t bits : differing_in) differing |= bits;
   std::vector<std::array<uint32_t, kDigits>> first(pieces);
-  std::vector<KeyedIndex> sorted(n);
+  BulkVector<KeyedIndex> sorted(n);
   for (int shift = 0; shift < 64; shift += kDigitBits) {
     const auto digit = [shift](uint64_t key) { return (key >> shift) & (kDigits - 1); };
     if (digit(differing) == 0) continue;

@@ -2,8 +2,8 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
+#include "core/base/bulk_vector.h"
 #include "core/base/executor.h"
 
 namespace farpoint {
@@ -15,6 +15,6 @@ struct KeyedIndex {
 
 // Sorts by key; equal keys keep their order. O(n) for each 11 bits in which keys differ (least
 // significant digit first), and as much memory again. The same result for any number of threads.
-void SortByKey(std::vector<KeyedIndex>& items, Executor& executor);
+void SortByKey(BulkVector<KeyedIndex>& items, Executor& executor);
 
 }  // namespace farpoint

@@ -355,18 +355,20 @@ struct Levels {
   }
 };
 
-// Room for an array at the end of a record, to be filled in place.
+// Room for an array at the end of a record, every element of which is to be set.
 template <typename T>
-T* AddArray(AlignedVector<std::byte>& record, uint64_t count) {
+T* AddArray(BulkVector<std::byte>& record, uint64_t count) {
   const size_t at = record.size();
   const size_t first = (at + sizeof count + kBlobAlignment - 1) / kBlobAlignment * kBlobAlignment;
   record.resize(first + count * sizeof(T));
+  std::fill(record.begin() + static_cast<ptrdiff_t>(at),
+            record.begin() + static_cast<ptrdiff_t>(first), std::byte{0});
   std::memcpy(record.data() + at, &count, sizeof count);
   return reinterpret_cast<T*>(record.data() + first);
 }
 
-AlignedVector<std::byte> Header(uint32_t magic, uint64_t surfels, size_t reserve) {
-  AlignedVector<std::byte> record;
+BulkVector<std::byte> Header(uint32_t magic, uint64_t surfels, size_t reserve) {
+  BulkVector<std::byte> record;
   record.reserve(reserve);
   record.resize(kHeaderBytes);
   std::memcpy(record.data(), &magic, sizeof magic);
@@ -375,7 +377,7 @@ AlignedVector<std::byte> Header(uint32_t magic, uint64_t surfels, size_t reserve
   return record;
 }
 
-Box3f BoxOf(const std::vector<Vec3f>& points, Executor& executor) {
+Box3f BoxOf(std::span<const Vec3f> points, Executor& executor) {
   constexpr size_t kPoints = size_t{1} << 16;
   std::vector<Box3f> boxes((points.size() + kPoints - 1) / kPoints);
   executor.ForEachPiece(points.size(), kPoints, [&](size_t begin, size_t end) {
@@ -392,11 +394,11 @@ Box3f BoxOf(const std::vector<Vec3f>& points, Executor& executor) {
 }
 
 // Surfels by (class, Hilbert index, position in the cloud).
-std::vector<uint32_t> SortSurfels(const SurfelCloud& cloud, const Box3f& box, Executor& executor) {
+BulkVector<uint32_t> SortSurfels(const SurfelCloud& cloud, const Box3f& box, Executor& executor) {
   const size_t n = cloud.size();
   const float edge = box.empty() ? 0.0f : MaxComponent(box.max - box.min);
   const float scale = edge > 0.0f ? 65535.0f / edge : 0.0f;
-  std::vector<KeyedIndex> keys(n);
+  BulkVector<KeyedIndex> keys(n);
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; i += kLanes) {
       const auto count = static_cast<uint32_t>(std::min<size_t>(kLanes, end - i));
@@ -417,7 +419,7 @@ std::vector<uint32_t> SortSurfels(const SurfelCloud& cloud, const Box3f& box, Ex
     }
   });
   SortByKey(keys, executor);
-  std::vector<uint32_t> order(n);
+  BulkVector<uint32_t> order(n);
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i) order[i] = keys[i].index;
   });
@@ -443,7 +445,7 @@ PointTree::Topology PointTree::BuildTopology(const SurfelCloud& cloud,
   PackedSurfels* const surfels = AddArray<PackedSurfels>(record, leaf_groups);
   PackedNodes* const nodes = AddArray<PackedNodes>(record, inner_groups);
 
-  std::vector<BuildNode> here(leaf_groups), above;  // nodes of the level at hand, and of the next
+  BulkVector<BuildNode> here(leaf_groups), above;  // nodes of the level at hand, and of the next
   executor.ForEachPiece(leaf_groups, kPiece / kLanes, [&](size_t begin, size_t end) {
     for (size_t g = begin; g < end; ++g) {
       const uint32_t count = levels.lanes(0, g);
@@ -469,7 +471,7 @@ PointTree::Topology PointTree::BuildTopology(const SurfelCloud& cloud,
     });
     here.swap(above);
   }
-  topology.blob = Blob::FromAligned(std::move(record));
+  topology.blob = Blob::FromBulk(std::move(record));
   return topology;
 }
 
@@ -514,7 +516,7 @@ Blob PointTree::BuildRadiance(const Topology& topology, const SurfelCloud& cloud
   std::copy(lit_sides.begin(), lit_sides.end(), AddArray<uint32_t>(record, lit_sides.size()));
   PackedRadiance* const radiance = AddArray<PackedRadiance>(record, levels.groups);
 
-  std::vector<RadianceNode> here(leaf_groups), above;
+  BulkVector<RadianceNode> here(leaf_groups), above;
   executor.ForEachPiece(leaf_groups, kPiece / kLanes, [&](size_t begin, size_t end) {
     for (size_t g = begin; g < end; ++g) {
       const uint32_t count = levels.lanes(0, g);
@@ -543,7 +545,7 @@ Blob PointTree::BuildRadiance(const Topology& topology, const SurfelCloud& cloud
     });
     here.swap(above);
   }
-  return Blob::FromAligned(std::move(record));
+  return Blob::FromBulk(std::move(record));
 }
 
 PointTree::Blobs PointTree::Build(const SurfelCloud& cloud, const SurfelShading& shading,

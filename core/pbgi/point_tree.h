@@ -18,8 +18,8 @@
 #include <span>
 #include <vector>
 
-#include "core/base/aligned.h"
 #include "core/base/blob.h"
+#include "core/base/bulk_vector.h"
 #include "core/base/executor.h"
 #include "core/base/status.h"
 #include "core/pbgi/packed_nodes.h"
@@ -56,7 +56,7 @@ class PointTree {
   // What does not depend on the lights: where the surfels stand in the tree, and the nodes.
   struct Topology {
     Blob blob;
-    std::vector<uint32_t> order;  // by slot of level 0: the surfel that it holds
+    BulkVector<uint32_t> order;  // by slot of level 0: the surfel that it holds
   };
 
   // Sorts, builds and serialises, in O(n). `open_sides` are the sides that are visible whatever
@@ -134,8 +134,8 @@ class PointTree {
 
   Blob topology_, radiance_blob_;
   // If they differ from the blob's.
-  AlignedVector<PackedSurfels> own_surfels_;
-  AlignedVector<PackedNodes> own_nodes_;
+  BulkVector<PackedSurfels> own_surfels_;
+  BulkVector<PackedNodes> own_nodes_;
   uint64_t surfel_count_ = 0, node_count_ = 0;
   std::vector<uint32_t> first_group_;       // by level
   std::span<const PackedSurfels> surfels_;  // groups of level 0

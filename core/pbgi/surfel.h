@@ -4,17 +4,18 @@
 #include <cstdint>
 #include <vector>
 
+#include "core/base/bulk_vector.h"
 #include "core/math/vec.h"
 
 namespace farpoint {
 
 // Structure of arrays; all of one length. Positions are relative to the scene's origin.
 struct SurfelCloud {
-  std::vector<Vec3f> position;
-  std::vector<Vec3f> normal;   // unit, geometric, by the winding: the front side
-  std::vector<float> area_m2;  // of the surface that the surfel stands for; sums to the scene's
-  std::vector<uint32_t> triangle;
-  std::vector<Vec2f> barycentric;  // weights of vertices 1 and 2
+  BulkVector<Vec3f> position;
+  BulkVector<Vec3f> normal;   // unit, geometric, by the winding: the front side
+  BulkVector<float> area_m2;  // of the surface that the surfel stands for; sums to the scene's
+  BulkVector<uint32_t> triangle;
+  BulkVector<Vec2f> barycentric;  // weights of vertices 1 and 2
 
   size_t size() const { return position.size(); }
 };
@@ -29,8 +30,8 @@ using SurfelSides = std::vector<uint8_t>;
 
 // What the surfels reflect. All of one length, parallel to a SurfelCloud.
 struct SurfelShading {
-  std::vector<Rgb> front, back;  // reflected radiance, W/(m² sr), diffuse: the same all round
-  SurfelSides visible_sides;     // those that are open, and those that a light reaches
+  BulkVector<Rgb> front, back;  // reflected radiance, W/(m² sr), diffuse: the same all round
+  SurfelSides visible_sides;    // those that are open, and those that a light reaches
 };
 
 }  // namespace farpoint

@@ -101,8 +101,8 @@ struct ObjectSampler::Impl {
     std::vector<CandidateLeaf> leaves;
     std::vector<KeyedIndex> visits;  // cube, leaf: each once
   };
-  std::vector<CandidateLeaf> leaves;
-  std::vector<KeyedIndex> visits;
+  BulkVector<CandidateLeaf> leaves;
+  BulkVector<KeyedIndex> visits;
 
   Impl(const ObjectShape& s, const PreparedScene& p, size_t o, Executor& e)
       : shape(s), prepared(p), object(p.objects()[o]), executor(e) {}

@@ -31,9 +31,9 @@ float DefaultSurfelSpacingM(double area_m2, float diagonal_m);
 // Where the surfels of one object lie on it. All of one length. Neighbours in the order are
 // neighbours in space: cubes of 16 spacings along a Morton curve.
 struct ObjectSurfels {
-  std::vector<uint32_t> triangle;  // of the object
-  std::vector<Vec2f> barycentric;  // weights of vertices 1 and 2
-  std::vector<float> area;         // units² of the shape; sums to its area without its holes
+  BulkVector<uint32_t> triangle;  // of the object
+  BulkVector<Vec2f> barycentric;  // weights of vertices 1 and 2
+  BulkVector<float> area;         // units² of the shape; sums to its area without its holes
 
   size_t size() const { return triangle.size(); }
   size_t size_bytes() const {

@@ -114,6 +114,7 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
     PieceCounts& counts = piece_counts[begin / kPiece];
     LightCounters light_counters;
     for (size_t i = begin; i < end; ++i) {
+      out.front[i] = out.back[i] = Rgb();
       const uint32_t t = cloud.triangle[i];
       const Vec2f b = cloud.barycentric[i];
       const Vec3f p = cloud.position[i];

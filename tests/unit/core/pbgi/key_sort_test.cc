@@ -15,11 +15,11 @@ TEST(SortByKey, EqualsAStableSort) {
     // All bits; few different keys; one bit; all the same.
     for (const uint64_t mask :
          {~uint64_t{0}, uint64_t{0xf0000700000003}, uint64_t{1} << 40, uint64_t{0}}) {
-      std::vector<KeyedIndex> items(n);
+      BulkVector<KeyedIndex> items(n);
       for (size_t i = 0; i < n; ++i) {
         items[i] = {HashKey(n, i) & mask, static_cast<uint32_t>(i)};
       }
-      std::vector<KeyedIndex> expected = items, other = items;
+      BulkVector<KeyedIndex> expected = items, other = items;
       std::stable_sort(expected.begin(), expected.end(),
                        [](const KeyedIndex& a, const KeyedIndex& b) { return a.key < b.key; });
       SortByKey(items, one);
