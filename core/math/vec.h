@@ -84,7 +84,9 @@ Vec3<T> NormalizeOr(const Vec3<T>& v, const Vec3<T>& fallback) {
     return fallback;
   }
   const Vec3<T> s = v / m;
-  return s / std::sqrt(Dot(s, s));
+  const T length2 = Dot(s, s);
+  // At least 1, or a NaN that the largest component did not show.
+  return length2 >= T(1) ? s / std::sqrt(length2) : fallback;
 }
 // Precondition: |v| is neither tiny nor huge.
 template <typename T>

@@ -38,9 +38,11 @@ inline V8 Select8(M8 mask, const V8& yes, const V8& no) {
 inline V8 NormalizeOr(const V8& v, const V8& fallback) {
   const F8 m = Max8(Max8(Abs8(v.x), Abs8(v.y)), Abs8(v.z));
   const V8 s = v / m;
-  const M8 good = (m >= Set8(std::numeric_limits<float>::min())) &
+  const F8 length2 = Dot(s, s);
+  // At least 1, or a NaN that the largest component did not show.
+  const M8 good = (length2 >= Set8(1.0f)) & (m >= Set8(std::numeric_limits<float>::min())) &
                   (m <= Set8(std::numeric_limits<float>::max()));
-  return Select8(good, s / Sqrt8(Dot(s, s)), fallback);
+  return Select8(good, s / Sqrt8(length2), fallback);
 }
 // Precondition: |v| is neither tiny nor huge.
 inline V8 Normalize(const V8& v) { return v / Sqrt8(Dot(v, v)); }

@@ -918,6 +918,12 @@ absl::StatusOr<std::unique_ptr<FrameRenderer>> FrameRenderer::Create(
     return absl::InvalidArgumentError(
         "camera: eye must be finite and right, up, forward orthonormal");
   }
+  // Rays that start further away are none to Embree, which ends the process.
+  constexpr double kMaxEyeM = 0x1p60;
+  if (!(MaxAbs(c.eye - static_cast<const LoadedSceneData&>(*scene).scene->origin()) <= kMaxEyeM)) {
+    return absl::InvalidArgumentError(
+        "camera: eye is more than 2^60 m away from the scene; move it closer");
+  }
   if (!(c.yfov_rad > 0.0) || !(c.yfov_rad < 3.1)) {
     return absl::InvalidArgumentError(
         "camera: the vertical field of view must lie between 0 and 177 degrees");

@@ -187,7 +187,7 @@ class ObjReader {
     size_t count = 0;
     FP_RETURN_IF_ERROR(ReadNumbers(rest, 3, 7, "position", v, count));
     const Vec3d p(v[0], v[1], v[2]);
-    if (!(MaxAbs(p) <= std::numeric_limits<float>::max())) {
+    if (!IsFinite(p) || MaxAbs(p) > std::numeric_limits<float>::max()) {
       return Fail(line_, "the position is beyond the range of single precision (3.4e38)");
     }
     FP_RETURN_IF_ERROR(CheckCount(positions_.size(), "positions"));

@@ -379,7 +379,7 @@ class PlyReader {
         [](size_t, std::span<const double>) { return absl::OkStatus(); },
         [&](uint64_t row) -> absl::Status {
           const Vec3d p(v[kX], v[kY], v[kZ]);
-          if (!(MaxAbs(p) <= std::numeric_limits<float>::max())) {
+          if (!IsFinite(p) || MaxAbs(p) > std::numeric_limits<float>::max()) {
             return Fail(element, row,
                         "the position is not finite or beyond the range of single precision");
           }

@@ -24,6 +24,7 @@ constexpr uint32_t kVersion = 2;
 // Squares of lengths up to 2^62 are floats, and so are areas down to 2^-120.
 constexpr double kMaxExtentM = 0x1p60;
 constexpr double kMinExtentM = 0x1p-30;
+constexpr double kMaxOriginM = 0x1p100;
 // A triangle is degenerate if its area is below this part of the scene's squared diagonal, or its
 // height below about this part of its longest edge.
 constexpr double kMinAreaRatio = 0x1p-60;
@@ -176,8 +177,9 @@ bool InRange(const Rgb& c, float max) {
 
 bool IsRotation(const std::array<Vec3d, 3>& axes) {
   const auto near = [](double a, double b) { return std::fabs(a - b) < 1e-6; };
+  // The largest of NaN and a number may be the number.
   return near(Length2(axes[0]), 1) && near(Length2(axes[1]), 1) && near(Dot(axes[0], axes[1]), 0) &&
-         MaxAbs(Cross(axes[0], axes[1]) - axes[2]) < 1e-6;
+         IsFinite(axes[2]) && MaxAbs(Cross(axes[0], axes[1]) - axes[2]) < 1e-6;
 }
 
 bool IsHalf(float f) { return HalfToFloat(FloatToHalf(f)) == f; }
@@ -298,6 +300,11 @@ class Builder {
       return absl::InvalidArgumentError(
           "the scene is more than 2^60 m across, beyond which squared distances overflow; scale it "
           "down or remove what lies far away");
+    }
+    if (std::max(MaxAbs(bounds.min), MaxAbs(bounds.max)) > kMaxOriginM) {
+      return absl::InvalidArgumentError(
+          "the scene lies more than 2^100 m from the world's origin, beyond which positions are no "
+          "floats; move it closer");
     }
     if (diagonal > 0 && diagonal < kMinExtentM) {
       return absl::InvalidArgumentError(
@@ -794,7 +801,9 @@ absl::Status PreparedScene::Read() {
 }
 
 absl::Status PreparedScene::CheckTables() const {
-  if (!IsFinite(origin_)) return BadBlob("the origin is not finite");
+  if (!IsFinite(origin_) || MaxAbs(origin_) > kMaxOriginM) {
+    return BadBlob("the origin is out of range");
+  }
   if (!InRange(sky_, kMaxRadiance)) return BadBlob("the sky's radiance is out of range");
   const uint64_t map_texels = uint64_t{map_width_} * map_height_;
   if ((map_width_ == 0) != (map_height_ == 0) || map_texels > kMaxMapTexels ||

@@ -265,6 +265,9 @@ TEST(Frame, RefusesWhatCannotBeRendered) {
   bad.yfov_rad = 0;
   EXPECT_FALSE(FrameRenderer::Create(loaded, {bad, Whole(8, 8), s}).ok());
   bad = scene.cameras[0];
+  bad.eye.y = 1e19;
+  EXPECT_FALSE(FrameRenderer::Create(loaded, {bad, Whole(8, 8), s}).ok());
+  bad = scene.cameras[0];
   bad.up = bad.forward;
   EXPECT_FALSE(FrameRenderer::Create(loaded, {bad, Whole(8, 8), s}).ok());
   EXPECT_FALSE(FrameRenderer::Create(loaded, {scene.cameras[0], Whole(0, 8), s}).ok());

@@ -105,9 +105,14 @@ TEST(V8, NormalizeFallsBackWhereThereIsNoDirection) {
   v.SetLane(1, Vec3f());
   v.SetLane(2, Vec3f(std::numeric_limits<float>::infinity(), 0, 0));
   v.SetLane(3, Vec3f(1e-42f, 0, 0));
+  for (int c = 0; c < 3; ++c) {
+    Vec3f bad(1, 1, 1);
+    bad[c] = std::numeric_limits<float>::quiet_NaN();
+    v.SetLane(static_cast<size_t>(4 + c), bad);
+  }
   const V8 n = NormalizeOr(v, V8(Vec3f(0, 0, 1)));
   EXPECT_EQ(n.Lane(0), Vec3f(0, 1, 0));
-  for (size_t k = 1; k < 4; ++k) EXPECT_EQ(n.Lane(k), Vec3f(0, 0, 1)) << k;
+  for (size_t k = 1; k < 7; ++k) EXPECT_EQ(n.Lane(k), Vec3f(0, 0, 1)) << k;
 }
 
 TEST(Frame8, HasTheSignOfZeroToo) {

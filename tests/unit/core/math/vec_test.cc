@@ -47,6 +47,8 @@ TEST(NormalizeOr, FallsBackWhereThereIsNoDirection) {
   EXPECT_EQ(NormalizeOr(Vec3f(1e-45f, 0, 0), fallback), fallback);
   EXPECT_EQ(NormalizeOr(Vec3f(inf, 0, 0), fallback), fallback);
   EXPECT_EQ(NormalizeOr(Vec3f(nan, 0, 0), fallback), fallback);
+  EXPECT_EQ(NormalizeOr(Vec3f(1, nan, 0), fallback), fallback);
+  EXPECT_EQ(NormalizeOr(Vec3f(1, 0, nan), fallback), fallback);
 }
 
 TEST(IsFinite, SeesEachComponent) {

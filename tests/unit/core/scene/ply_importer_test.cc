@@ -175,6 +175,7 @@ TEST(PlyImporter, RefusesDataWithItsPlace) {
   const std::pair<const char*, const char*> refusals[] = {
       {"0 0 0\n1 0 0\n0 x 0\n1 1 0\n7 3 0 1 2\n7 3 0 1 2\n", "vertex 2, line 14: 'x' for 'y'"},
       {"0 0 0\n1 0 0\n0 1 0\nnan 1 0\n7 3 0 1 2\n7 3 0 1 2\n", "vertex 3, line 15: the position"},
+      {"0 0 0\n1 0 0\n0 1 0\n1 nan 0\n7 3 0 1 2\n7 3 0 1 2\n", "vertex 3, line 15: the position"},
       {"0 0 0\n1 0 0\n0 1 0\n1 1e60 0\n7 3 0 1 2\n7 3 0 1 2\n", "vertex 3, line 15: the position"},
       {"0 0 0\n1 0 0\n0 1 0\n1 1 0\n7 3 0 1 2\n7 3 0 1 4\n", "face 1: vertex index 4 is beyond"},
       {"0 0 0\n1 0 0\n0 1 0\n1 1 0\n7 3 0 1 -2\n7 3 0 1 3\n", "face 0, line 16: a vertex index"},

@@ -239,6 +239,9 @@ TEST(PreparedScene, RefusesWhatFloatsCannotHold) {
   scene = TriangleScene();
   for (Vec3d& column : scene.instances[0].world_from_mesh.column) column *= 1e-12;
   EXPECT_THAT(MessageOf(scene), HasSubstr("scale it up"));
+  scene = TriangleScene();
+  scene.instances[0].world_from_mesh.translation = {0, 0, 2e30};
+  EXPECT_THAT(MessageOf(scene), HasSubstr("2^100 m"));
   // Vertices that no triangle uses do not count.
   scene = TriangleScene();
   scene.meshes[0].positions.push_back(Vec3f(std::numeric_limits<float>::infinity()));
@@ -563,6 +566,14 @@ TEST(PreparedScene, RefusesABadEnvironment) {
   scene = good;
   scene.environment.world_from_map[0] = {-1, 0, 0};
   EXPECT_THAT(MessageOf(scene), HasSubstr("orthonormal"));
+  for (int row = 0; row < 3; ++row) {
+    for (int c = 0; c < 3; ++c) {
+      scene = good;
+      scene.environment.world_from_map[static_cast<size_t>(row)][c] =
+          std::numeric_limits<double>::quiet_NaN();
+      EXPECT_THAT(MessageOf(scene), HasSubstr("orthonormal")) << row << " " << c;
+    }
+  }
 }
 
 TEST(PreparedScene, MeanEmissionIsZeroOnlyForBlackTriangles) {
