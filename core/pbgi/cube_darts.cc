@@ -153,7 +153,7 @@ void CubeDarts::Throw(uint64_t random, std::vector<AcceptedCandidate>& accepted)
     const auto cell = static_cast<int>(c.cell);
     Close({cell % kCubeCells, cell / kCubeCells % kCubeCells, cell / (kCubeCells * kCubeCells)},
           c.position, c.normal);
-    accepted.push_back({c.position, c.triangle, c.barycentric, 0});
+    accepted.push_back({c.position, c.triangle, c.barycentric, 0, c.cell});
   }
 }
 

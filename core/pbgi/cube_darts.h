@@ -22,6 +22,7 @@ struct AcceptedCandidate {
   uint32_t triangle;
   Vec2f barycentric;
   uint32_t share;  // candidates that are nearest to it
+  uint32_t cell;   // within its cube: (z * kCubeCells + y) * kCubeCells + x
 };
 
 // What one thread needs to work on a cube; used for one cube after the other. Cells of the cube

@@ -367,6 +367,7 @@ ObjectSurfels ObjectSampler::Sample() {
 
   // What one thread needs for a cube.
   static thread_local std::unique_ptr<CubeDarts> darts_of_thread;
+  static_assert(kCubeBits == 4);
   // With the candidates of a cube, and the surfels that there are about it.
   const auto load = [&](size_t at, bool own) -> CubeDarts& {
     if (!darts_of_thread) darts_of_thread = std::make_unique<CubeDarts>();
@@ -392,16 +393,19 @@ ObjectSurfels ObjectSampler::Sample() {
           if (dx == 0 && dy == 0 && dz == 0 && !own) continue;
           const uint32_t neighbour = table[slot_of(NeighbourCube(cube.code, dx, dy, dz))];
           if (neighbour == kNone) continue;
+          // Of a neighbour the layer of cells that touches the cube.
+          const auto layer = [](int d) { return d < 0 ? kCubeCells - 1 : 0; };
+          const uint32_t mask =
+              (dx != 0 ? 0x00fu : 0u) | (dy != 0 ? 0x0f0u : 0u) | (dz != 0 ? 0xf00u : 0u);
+          const uint32_t touching =
+              static_cast<uint32_t>(layer(dx) | layer(dy) << 4 | layer(dz) << 8) & mask;
           for (AcceptedCandidate& a : cubes[neighbour].accepted) {
-            const auto local = [&](float p, float origin, size_t axis) {
-              // From the layer of cells before the cube.
-              const uint32_t cell = impl.lattice.CellOf(Set8(p), origin)[0];
-              return static_cast<int>((cell - first_cell[axis] + 1) & kCellMask) - 1;
+            if ((a.cell & mask) != touching) continue;
+            const auto local = [&](int d, int shift) {
+              return d * kCubeCells + static_cast<int>(a.cell >> shift & 0xfu);
             };
-            const Vec3f& origin = impl.lattice.origin;
-            darts.AddSurfel({local(a.position.x, origin.x, 0), local(a.position.y, origin.y, 1),
-                             local(a.position.z, origin.z, 2)},
-                            a.position, normals[a.triangle], &a.share);
+            darts.AddSurfel({local(dx, 0), local(dy, 4), local(dz, 8)}, a.position,
+                            normals[a.triangle], &a.share);
           }
         }
       }
