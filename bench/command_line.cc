@@ -14,7 +14,7 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array<std::string_view, 3> kNotBuilt = {"scale", "skip", "service"};
+constexpr std::array<std::string_view, 2> kNotBuilt = {"skip", "service"};
 
 // "1280x1000". Sizes are checked by ValidateFilm.
 bool ParseResolution(std::string_view text, int& width, int& height) {
@@ -68,9 +68,9 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   line.output_dir = "out/bench";
   if (!args.empty() &&
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
-    return absl::UnimplementedError(
-        "'" + args.front() +
-        "' is not built yet; use accuracy, paper, pareto, rebake, lights, micro or stability");
+    return absl::UnimplementedError("'" + args.front() +
+                                    "' is not built yet; use accuracy, paper, pareto, scale, "
+                                    "rebake, lights, micro or stability");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -268,6 +268,47 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
 
+  ScaleOptions& g = line.scale;
+  std::string scale_resolution, scale_quality(NameOf(g.quality));
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) g.scenes_dir = scenes;
+  CLI::App* scale = app.add_subcommand(
+      "scale", "Growth with pixels, surfels and threads; writes scale.json and scale.html");
+  AddCommonOptions(*scale, line.output_dir, g.quick);
+  scale->add_option("--scene", g.scene,
+                    "cornell, bunny, city or sponza [sponza, city where it is not there]");
+  scale->add_option("--scenes", g.scenes_dir, "Folder of scenes of others [FARPOINT_SCENES]");
+  CLI::Option* scale_resolution_option = scale->add_option(
+      "--resolution", scale_resolution,
+      "WxH of the largest frame, multiples of 4; half and a quarter are rendered, too "
+      "[1280x1000, quick: 64x64]");
+  scale
+      ->add_option("--points", g.points,
+                   "The fewest surfels; 4 and 16 times as many are taken, too "
+                   "[1000000, quick: 2000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 27));
+  scale->add_option("--quality", scale_quality, "draft, normal or fine")->capture_default_str();
+  scale->add_option("--clusters", g.clusters, "k per block [0: adaptive]")
+      ->check(CLI::Range(0, 1024));
+  scale->add_option("--light-samples", g.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  scale->add_option("--seed", g.seed, "Of every random choice")->capture_default_str();
+  scale->add_option("--repeat", g.repeat, "Renders of each frame [3, quick: 1]")
+      ->check(CLI::Range(1, 1000));
+  scale
+      ->add_option("--reference-pixels", g.reference_pixels,
+                   "Pixels of a traced reference [1500, quick: 16]")
+      ->check(CLI::Range(size_t{16}, size_t{1} << 20));
+  scale
+      ->add_option("--reference-budget", g.reference_budget_s,
+                   "Thread-seconds for each traced reference [60, quick: 0.5]")
+      ->check(CLI::Range(0.01, 1e6));
+  scale->add_option("--reference-dir", g.reference_dir,
+                    "Folder that keeps traced references from run to run");
+  scale->add_option("--threads", g.threads, "0: all cores; one is measured, too")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -279,6 +320,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                             : lights->parsed()    ? lights
                             : paper->parsed()     ? paper
                             : stability->parsed() ? stability
+                            : scale->parsed()     ? scale
                                                   : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -294,10 +336,14 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
               : accuracy->parsed()  ? BenchVerb::kAccuracy
               : paper->parsed()     ? BenchVerb::kPaper
               : stability->parsed() ? BenchVerb::kStability
+              : scale->parsed()     ? BenchVerb::kScale
                                     : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
   a.quality = *asked_quality;
+  const absl::StatusOr<Quality> scale_asked = QualityFromName(scale_quality);
+  if (!scale_asked.ok()) return Annotate(scale_asked.status(), "--quality");
+  g.quality = *scale_asked;
   const absl::StatusOr<Fill> asked_fill = FillFromName(fill);
   if (!asked_fill.ok()) return Annotate(asked_fill.status(), "--fill");
   a.fill = *asked_fill;
@@ -310,6 +356,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
     }
   }
   if (!w.scene.empty()) FP_RETURN_IF_ERROR(FindPaperScene(w.scene).status());
+  if (!g.scene.empty()) FP_RETURN_IF_ERROR(FindPaperScene(g.scene).status());
   r.cache_bytes = cache_mib << 20;
   if (!sun.empty()) {
     FP_ASSIGN_OR_RETURN(r.changes.sun, ParseSun(sun));
@@ -349,6 +396,11 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   if (paper_resolution_option->count() > 0 &&
       !ParseResolution(paper_resolution, w.width, w.height)) {
     return absl::InvalidArgumentError("--resolution " + paper_resolution +
+                                      " is not WIDTHxHEIGHT in pixels, such as 640x480");
+  }
+  if (scale_resolution_option->count() > 0 &&
+      !ParseResolution(scale_resolution, g.width, g.height)) {
+    return absl::InvalidArgumentError("--resolution " + scale_resolution +
                                       " is not WIDTHxHEIGHT in pixels, such as 640x480");
   }
   if (noise_option->count() > 0) p.noise = noise;

@@ -11,12 +11,13 @@
 #include "bench/paper.h"
 #include "bench/pareto.h"
 #include "bench/rebake.h"
+#include "bench/scale.h"
 #include "bench/stability.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability, kScale };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -28,6 +29,7 @@ struct BenchCommandLine {
   AccuracyOptions accuracy;
   PaperOptions paper;
   StabilityOptions stability;
+  ScaleOptions scale;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -10,6 +10,7 @@
 #include "bench/command_line.h"
 #include "bench/paper_report.h"
 #include "bench/pareto_report.h"
+#include "bench/scale_report.h"
 #include "bench/stability_report.h"
 #include "core/base/blob.h"
 #include "core/image/png_io.h"
@@ -130,6 +131,25 @@ absl::Status Stability(const BenchCommandLine& line, std::ostream& out, std::ost
   return absl::OkStatus();
 }
 
+absl::Status Scale(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "scale.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const ScaleReport report, RunScale(line.scale, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  for (const std::string& note : report.notes) err << "farpoint-bench: note: " << note << "\n";
+  FP_RETURN_IF_ERROR(WriteText(dir / "scale.json", ScaleJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "scale.html", ScaleHtml(report)));
+  out << ScaleTable(report) << "\n"
+      << (dir / "scale.json").string() << "\n"
+      << (dir / "scale.html").string() << "\n";
+  return absl::OkStatus();
+}
+
 absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
   FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
                         err << "farpoint-bench: " << text << std::endl;
@@ -178,6 +198,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Paper(line, out, err);
     case BenchVerb::kStability:
       return Stability(line, out, err);
+    case BenchVerb::kScale:
+      return Scale(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
