@@ -53,9 +53,9 @@ TEST(BenchProgram, PaperLeavesItsReports) {
 
 TEST(BenchProgram, ScaleLeavesItsReports) {
   const TempFolder folder;
-  const Ran ran = RunArgs({"scale", "--quick", "--scene", "cornell", "--resolution", "16x16",
-                           "--points", "300", "--clusters", "4", "--reference-budget", "0.05",
-                           "-o", folder.path().string()});
+  const Ran ran =
+      RunArgs({"scale", "--quick", "--scene", "cornell", "--resolution", "16x16", "--points", "300",
+               "--clusters", "4", "--reference-budget", "0.05", "-o", folder.path().string()});
   ASSERT_EQ(ran.code, 0) << ran.err;
   EXPECT_THAT(ran.out, HasSubstr("preparation"));
   EXPECT_EQ(nlohmann::json::parse(ReadText(folder / "scale.json"))["settings"]["clusters"], 4);
