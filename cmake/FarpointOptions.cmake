@@ -4,12 +4,21 @@
 #   -march=x86-64-v3      one instruction set for every machine; no dispatch decides a pixel
 #   -ffp-contract=off     a multiply-add is fused only where the code says std::fma
 #   no -ffast-math        -fno-math-errno and -fno-trapping-math change no value
+# Debug builds and those of GCC with the address sanitizer trap floating-point exceptions
+# (core/base/fp_trap.h), so they do without the last: it lets the compiler speculate divisions.
+if(FARPOINT_SANITIZE MATCHES address AND CMAKE_CXX_COMPILER_ID STREQUAL GNU)
+  set(traps 1)
+else()
+  set(traps $<CONFIG:Debug>)
+endif()
 add_library(farpoint_options INTERFACE)
 target_compile_options(farpoint_options INTERFACE
-  -march=x86-64-v3 -ffp-contract=off -fno-math-errno -fno-trapping-math
+  -march=x86-64-v3 -ffp-contract=off -fno-math-errno
+  $<$<NOT:${traps}>:-fno-trapping-math>
   -Wall -Wextra -Wno-unused-parameter -Wno-missing-field-initializers -Wno-restrict)
 target_include_directories(farpoint_options INTERFACE ${PROJECT_SOURCE_DIR})
-target_compile_definitions(farpoint_options INTERFACE FARPOINT_VERSION="${PROJECT_VERSION}")
+target_compile_definitions(farpoint_options INTERFACE FARPOINT_VERSION="${PROJECT_VERSION}"
+  $<${traps}:FARPOINT_TRAP_FP>)
 if(FARPOINT_SANITIZE)
   target_compile_options(farpoint_options INTERFACE
     -fsanitize=${FARPOINT_SANITIZE} -fno-omit-frame-pointer -fno-sanitize-recover=all)

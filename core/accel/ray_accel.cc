@@ -8,6 +8,8 @@
 
 #include <string>
 
+#include "core/base/fp_trap.h"
+
 namespace farpoint {
 
 namespace {
@@ -106,6 +108,7 @@ absl::StatusOr<std::shared_ptr<const RayAccel>> RayAccel::Build(
 
 std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& direction,
                                           float t_max) const {
+  const FpTrapPause pause;
   if (record_ != nullptr) [[unlikely]]
     record_->push_back({origin, direction, t_max, false});
   RTCRayHit query;
@@ -124,6 +127,7 @@ std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& dire
 }
 
 bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max) const {
+  const FpTrapPause pause;
   if (record_ != nullptr) [[unlikely]]
     record_->push_back({origin, direction, t_max, true});
   RTCRay ray;

@@ -7,9 +7,36 @@
 
 #include <algorithm>
 
+#include "core/base/fp_trap.h"
+
+#ifdef __SANITIZE_THREAD__
+extern "C" void __tsan_acquire(void* address);
+extern "C" void __tsan_release(void* address);
+#endif
+
 namespace farpoint {
 
 namespace {
+
+// What the thread sanitizer cannot see, as oneTBB is built without it: a loop begins after what was
+// done before it, and ends after all of its bodies.
+class LoopOrder {
+ public:
+  void Begins() { Release(&begin_); }
+  void BodyBegins() { Acquire(&begin_); }
+  void BodyEnds() { Release(&end_); }
+  void Ends() { Acquire(&end_); }
+
+ private:
+#ifdef __SANITIZE_THREAD__
+  static void Acquire(void* at) { __tsan_acquire(at); }
+  static void Release(void* at) { __tsan_release(at); }
+#else
+  static void Acquire(void*) {}
+  static void Release(void*) {}
+#endif
+  char begin_ = 0, end_ = 0;
+};
 
 unsigned UsableCores() {
   cpu_set_t set;
@@ -35,15 +62,22 @@ Executor::~Executor() = default;
 void Executor::ForEach(size_t count, size_t grain, const std::function<void(size_t)>& body) {
   if (count == 0) return;
   if (threads_ == 1) {
+    const FpTrap trap;
     for (size_t i = 0; i < count; ++i) body(i);
     return;
   }
+  LoopOrder order;
+  order.Begins();
   impl_->arena.execute([&] {
     tbb::parallel_for(tbb::blocked_range<size_t>(0, count, std::max<size_t>(1, grain)),
                       [&](const tbb::blocked_range<size_t>& range) {
+                        const FpTrap trap;
+                        order.BodyBegins();
                         for (size_t i = range.begin(); i != range.end(); ++i) body(i);
+                        order.BodyEnds();
                       });
   });
+  order.Ends();
 }
 
 void Executor::ForEachPiece(size_t count, size_t piece,

@@ -6,6 +6,7 @@
 #include <limits>
 #include <span>
 
+#include "core/base/fp_trap.h"
 #include "core/math/elementary8.h"
 #include "core/math/sampling.h"
 #include "core/math/simd8.h"
@@ -291,6 +292,7 @@ void LightSampler::AddPunctualLights() {
 //   tan(Ω/2) = a·(b × c) / (|a||b||c| + a·b |c| + b·c |a| + c·a |b|),
 // the arc tangent to 0.5 %. It is 0 only if the triangle lies below the horizon or is seen edge-on.
 F8 LightSampler::WeightOf(const EmitterLanes& e, const V8& p, const V8& n) {
+  const FpTrapPause pause;  // lanes that are left out
   const F8 zero = Set8(0), one = Set8(1), least = Set8(std::numeric_limits<float>::min());
   const auto inverse_of = [&](const V8& to) { return one / Max8(Sqrt8(Length2(to)), least); };
   const V8 to_a = e.a - p, to_b = e.b - p, to_c = e.c - p;
@@ -327,6 +329,7 @@ void LightSampler::Weigh(const EmitterBlock& block, const Vec3f& p, const Vec3f&
 // The irradiance that arrives if nothing is in the way.
 void LightSampler::Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f& n,
                          LightTree::Weights& weights) {
+  const FpTrapPause pause;  // lanes that are left out
   const F8 zero = Set8(0), one = Set8(1), least = Set8(std::numeric_limits<float>::min());
   const F8 vx = Load8(block.position[0].data()) - Set8(p.x),
            vy = Load8(block.position[1].data()) - Set8(p.y),
@@ -627,6 +630,7 @@ LightSampler::EmitterSamples LightSampler::SampleEach(const SurfacePoints8& poin
 }
 
 LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) const {
+  const FpTrapPause pause;  // lanes that are left out
   const EmitterDirections to = Directions(samples);
   const F8 zero = Set8(0.0f);
   const F8 cosine = Dot(samples.n, to.direction);

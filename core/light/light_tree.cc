@@ -4,6 +4,7 @@
 #include <cmath>
 #include <utility>
 
+#include "core/base/fp_trap.h"
 #include "core/math/elementary.h"
 #include "core/math/simd4d.h"
 
@@ -215,6 +216,7 @@ uint32_t LightTree::Build(std::span<const LightBounds> lights, std::span<uint32_
 }
 
 LightTree::Choices8 LightTree::ChooseInBlock8(std::span<const F8> weights, const U8& u_bits) {
+  const FpTrapPause pause;  // lanes that are left out
   constexpr double kBelowOne = 1.0 - 0x1p-53;
   const D4 zero = Set4(0.0), one = Set4(1.0);
   std::array<D4, 2> probability, rest, chosen, any;

@@ -3,6 +3,7 @@
 
 #include <cstddef>
 
+#include "core/base/fp_trap.h"
 #include "core/math/simd8.h"
 #include "core/math/vec.h"
 
@@ -36,6 +37,7 @@ inline V8 Select8(M8 mask, const V8& yes, const V8& no) {
   return {Select8(mask, yes.x, no.x), Select8(mask, yes.y, no.y), Select8(mask, yes.z, no.z)};
 }
 inline V8 NormalizeOr(const V8& v, const V8& fallback) {
+  const FpTrapPause pause;  // lanes that take the fallback
   const F8 m = Max8(Max8(Abs8(v.x), Abs8(v.y)), Abs8(v.z));
   const V8 s = v / m;
   const F8 length2 = Dot(s, s);

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 
+#include "core/base/fp_trap.h"
 #include "core/math/elementary.h"
 #include "core/math/simd8.h"
 
@@ -191,6 +192,7 @@ class Rasterizer {
   // that surround the view. Coverage: a kernel (3 A / (pi R²)) (1 - rho² / R²)² of the distance rho
   // to the disc's centre, whose integral over the plane is the surfel's area.
   void DrawDisc(const CutNode& node) {
+    const FpTrapPause pause;  // lanes that are left out
     const bool opaque = splat_ == Splat::kOpaque;
     const Surfel surfel = tree_.surfel(node.slot);
     const Rgb radiance = Radiance(node);

@@ -6,6 +6,7 @@
 #include <span>
 
 #include "core/base/check.h"
+#include "core/base/fp_trap.h"
 
 namespace farpoint {
 
@@ -31,6 +32,7 @@ double PowerOfTwoBelow(double x) {
 // cyclic sweeps (Golub and Van Loan, "Matrix Computations", 8.5).
 void Diagonalize(Matrix3& a, Matrix3& v) {
   for (int i = 0; i < 3; ++i) v.m[i][i] = 1;
+  const FpTrapPause pause;     // theta may overflow: there is nothing to turn then
   constexpr int kSweeps = 16;  // it converges quadratically: 5 or 6 do
   for (int sweep = 0; sweep < kSweeps; ++sweep) {
     for (const auto& [p, q] : {std::pair{0, 1}, std::pair{0, 2}, std::pair{1, 2}}) {

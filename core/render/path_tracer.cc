@@ -8,6 +8,7 @@
 #include <optional>
 #include <span>
 
+#include "core/base/fp_trap.h"
 #include "core/math/sampling.h"
 #include "core/math/simd4d.h"
 #include "core/math/vec8.h"
@@ -104,6 +105,7 @@ void KeepWhatReflects(const PreparedScene& scene, Hits& hits) {
 // Where eight paths have hit, with normals on the side that they came from, as PreparedScene gives
 // them.
 SurfacePoints8 SurfaceAt(const Hits& hits, size_t i) {
+  const FpTrapPause pause;  // lanes that are left out
   const F8 zero = Set8(0.0f), one = Set8(1.0f);
   const F8 b1 = Load8(&hits.b1[i]), b2 = Load8(&hits.b2[i]);
   const V8 a = hits.vertex[0].Load(i), b = hits.vertex[1].Load(i), c = hits.vertex[2].Load(i);

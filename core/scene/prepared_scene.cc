@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "core/base/byte_io.h"
+#include "core/base/fp_trap.h"
 #include "core/math/elementary.h"
 #include "core/math/sampling.h"
 #include "core/scene/image_decode.h"
@@ -443,6 +444,7 @@ class Builder {
     }
     std::vector<absl::StatusOr<DecodedImage>> decoded(images.size(), absl::UnknownError(""));
     executor_.ForEach(images.size(), 1, [&](size_t i) {
+      const FpTrapPause pause;
       decoded[i] = DecodeImage(images[i]->name, images[i]->encoded.bytes());
     });
     texels_.reserve(total);

@@ -96,7 +96,7 @@ class Dev(TreeTest):
     def test_help_names_every_command(self):
         code, out, _, _ = self.run_dev("--help")
         self.assertEqual(0, code)
-        for command in ("build", "demo", "test", "bench", "format"):
+        for command in ("build", "demo", "test", "asan", "tsan", "fuzz", "bench", "format"):
             self.assertIn(f"\n  {command} ", out)
 
     def test_unknown_commands_are_a_usage_error(self):

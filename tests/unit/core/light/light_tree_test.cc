@@ -35,7 +35,7 @@ class Chooser {
     const float d = Length(v);
     if (!(d > 0) || d > l.reach_m) return 0;
     if (-Dot(v, l.axis) / d < l.cos_cone) return 0;
-    return l.power * std::max(0.0f, Dot(v, n)) / (d * d * d);
+    return l.power * std::max(0.0f, Dot(v, n)) / d / d / d;  // d³ may vanish
   }
   std::optional<LightTree::Choice> Choose(const Vec3f& p, const Vec3f& n, double& u,
                                           LightTree::Cache& cache) const {

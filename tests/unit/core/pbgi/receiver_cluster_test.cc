@@ -49,6 +49,35 @@ TEST(ReceiverCluster, FastAssignmentEqualsTheLiteralOne) {
   }
 }
 
+// Ties go to the lower index, so a round that changes nothing is the last one: hundreds of rounds,
+// odd or even, end where they would without a bound.
+TEST(ReceiverCluster, RoundsEndAndDoNotCycle) {
+  std::vector<Receiver> grid;  // equal distances everywhere
+  for (int i = 0; i < 256; ++i) {
+    Receiver r;
+    r.position = Vec3f(static_cast<float>(i % 16), static_cast<float>(i / 16), 0);
+    r.normal = r.geometric_normal = {0, 0, 1};
+    grid.push_back(r);
+  }
+  // Three places only: most centres are re-seeded over and over.
+  std::vector<Receiver> places = grid;
+  for (size_t i = 0; i < places.size(); ++i) {
+    places[i].position = Vec3f(static_cast<float>(i % 3), 0, 0);
+  }
+  for (const auto& receivers : {Block(), grid, places}) {
+    for (const uint32_t k : {2u, 9u, 40u, 250u}) {
+      for (uint64_t seed = 0; seed < 10; ++seed) {
+        ClusterParams p = Params(k);
+        p.seed_key = seed;
+        p.iterations = 400;
+        const auto end = AssignClusters(receivers, p);
+        p.iterations = 401;
+        EXPECT_EQ(AssignClusters(receivers, p), end) << "k " << k << " seed " << seed;
+      }
+    }
+  }
+}
+
 TEST(ReceiverCluster, EveryReceiverIsInExactlyOneCluster) {
   const auto receivers = Block();
   for (const uint32_t k : {1u, 7u, 100u, 5000u}) {
