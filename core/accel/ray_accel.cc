@@ -6,7 +6,10 @@
 #include <embree3/rtcore.h>
 #endif
 
+#include <array>
+#include <mutex>
 #include <string>
+#include <vector>
 
 #include "core/base/fp_trap.h"
 
@@ -14,17 +17,31 @@ namespace farpoint {
 
 namespace {
 
+// Triangles of masked materials are a geometry of their own, so that only their hits are asked for
+// alpha.
+enum : unsigned { kOpaque = 0, kMasked = 1 };
+
+// Spatial splits make rays of a bundle a tenth faster (Sponza) and take five times as long to
+// build: 0.2 s for 262,000 triangles.
+constexpr size_t kMostSplitTriangles = 2'000'000;
+
+// What the filter of the masked geometry needs.
+struct Masks {
+  const PreparedScene* scene = nullptr;
+  std::vector<uint32_t> triangles;  // of the masked geometry's primitives
+};
+
 // Makes holes of the points whose alpha lies below the cutoff, for nearest-hit and any-hit rays.
 void AlphaFilter(const RTCFilterFunctionNArguments* args) {
-  const auto& scene = *static_cast<const PreparedScene*>(args->geometryUserPtr);
+  const auto& masks = *static_cast<const Masks*>(args->geometryUserPtr);
   for (unsigned i = 0; i < args->N; ++i) {
     if (args->valid[i] == 0) continue;
-    const uint32_t triangle = RTCHitN_primID(args->hit, args->N, i);
-    const PreparedMaterial& material = scene.MaterialOf(triangle);
-    if (material.alpha_cutoff < 0.0f) continue;
+    const uint32_t triangle = masks.triangles[RTCHitN_primID(args->hit, args->N, i)];
     const float b1 = RTCHitN_u(args->hit, args->N, i);
     const float b2 = RTCHitN_v(args->hit, args->N, i);
-    if (scene.Alpha(triangle, b1, b2) < material.alpha_cutoff) args->valid[i] = 0;
+    if (masks.scene->Alpha(triangle, b1, b2) < masks.scene->MaterialOf(triangle).alpha_cutoff) {
+      args->valid[i] = 0;
+    }
   }
 }
 
@@ -48,9 +65,58 @@ void FillRay(RTCRay& ray, const Vec3f& origin, const Vec3f& direction, float t_m
 struct RayAccel::Impl {
   RTCDevice device = nullptr;
   RTCScene scene = nullptr;
+  RTCScene loose = nullptr;  // without the robust flag
+  RTCGeometry geometries[2] = {nullptr, nullptr};
+  std::vector<uint32_t> opaque;  // triangles of kOpaque's primitives; empty: each is its own
+  Masks masks;
+  std::string error_text;
+  std::once_flag loose_once;
   ~Impl() {
+    for (RTCGeometry geometry : geometries) {
+      if (geometry) rtcReleaseGeometry(geometry);
+    }
     if (scene) rtcReleaseScene(scene);
+    if (loose) rtcReleaseScene(loose);
     if (device) rtcReleaseDevice(device);
+  }
+
+  // A scene of the geometries.
+  RTCScene MakeScene(RTCSceneFlags flags, RTCBuildQuality quality) {
+    RTCScene made = rtcNewScene(device);
+    rtcSetSceneFlags(made, flags);
+    rtcSetSceneBuildQuality(made, quality);
+    for (unsigned id = 0; id < 2; ++id) {
+      if (geometries[id]) rtcAttachGeometryByID(made, geometries[id], id);
+    }
+    rtcCommitScene(made);
+    return made;
+  }
+
+  uint32_t TriangleOf(unsigned geometry, uint32_t primitive) const {
+    if (geometry == kMasked) return masks.triangles[primitive];
+    return opaque.empty() ? primitive : opaque[primitive];
+  }
+
+  // Runs a query for the nearest hit; false: none.
+  static bool Nearest(RTCScene in, RTCRayHit& query) {
+    query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+    query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+#if RTC_VERSION_MAJOR >= 4
+    rtcIntersect1(in, &query);
+#else
+    RTCIntersectContext context;
+    rtcInitIntersectContext(&context);
+    rtcIntersect1(in, &context, &query);
+#endif
+    return query.hit.geomID != RTC_INVALID_GEOMETRY_ID;
+  }
+
+  RayHit HitOf(const RTCRayHit& query) const {
+    const bool front = !(query.hit.Ng_x * query.ray.dir_x + query.hit.Ng_y * query.ray.dir_y +
+                             query.hit.Ng_z * query.ray.dir_z >
+                         0.0f);
+    return {query.ray.tfar, TriangleOf(query.hit.geomID, query.hit.primID), query.hit.u,
+            query.hit.v, front};
   }
 };
 
@@ -72,38 +138,59 @@ absl::StatusOr<std::shared_ptr<const RayAccel>> RayAccel::Build(
         "Embree gave no device; this machine's processor must know AVX2 (rtcNewDevice error " +
         std::to_string(static_cast<int>(rtcGetDeviceError(nullptr))) + ")");
   }
-  std::string error_text;
   rtcSetDeviceErrorFunction(
       impl.device,
       [](void* text, RTCError code, const char* what) {
         *static_cast<std::string*>(text) =
             "Embree error " + std::to_string(static_cast<int>(code)) + ": " + (what ? what : "");
       },
-      &error_text);
-  impl.scene = rtcNewScene(impl.device);
-  rtcSetSceneFlags(impl.scene, RTC_SCENE_FLAG_ROBUST);
+      &impl.error_text);
   const PreparedScene& s = *accel->scene_;
-  if (!s.triangles().empty()) {
+  const auto add = [&](unsigned id, const std::vector<uint32_t>& triangles) {
     RTCGeometry geometry = rtcNewGeometry(impl.device, RTC_GEOMETRY_TYPE_TRIANGLE);
+    impl.geometries[id] = geometry;
     // Embree reads 16 bytes at each vertex; the blob goes on after the last one.
     rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
                                s.vertices().data(), 0, sizeof(Vec3f), s.vertices().size());
-    rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
-                               s.triangles().data(), 0, sizeof(PreparedTriangle),
-                               s.triangles().size());
-    rtcSetGeometryUserData(geometry, const_cast<PreparedScene*>(&s));
-    if (s.has_alpha_masks()) {
+    if (triangles.empty()) {
+      rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
+                                 s.triangles().data(), 0, sizeof(PreparedTriangle),
+                                 s.triangles().size());
+    } else if (auto* out = static_cast<std::array<uint32_t, 3>*>(
+                   rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
+                                           sizeof(std::array<uint32_t, 3>), triangles.size()))) {
+      for (const uint32_t t : triangles) *out++ = s.triangles()[t].vertex;
+    }
+    if (id == kMasked) {
+      rtcSetGeometryUserData(geometry, &impl.masks);
       rtcSetGeometryIntersectFilterFunction(geometry, AlphaFilter);
       rtcSetGeometryOccludedFilterFunction(geometry, AlphaFilter);
     }
     rtcCommitGeometry(geometry);
-    rtcAttachGeometry(impl.scene, geometry);
-    rtcReleaseGeometry(geometry);
+  };
+  if (s.has_alpha_masks()) {
+    impl.masks.scene = &s;
+    for (uint32_t t = 0; t < s.triangles().size(); ++t) {
+      (s.MaterialOf(t).alpha_cutoff < 0.0f ? impl.opaque : impl.masks.triangles).push_back(t);
+    }
+    if (!impl.opaque.empty()) add(kOpaque, impl.opaque);
+    if (!impl.masks.triangles.empty()) add(kMasked, impl.masks.triangles);
+  } else if (!s.triangles().empty()) {
+    add(kOpaque, {});
   }
-  rtcCommitScene(impl.scene);
-  rtcSetDeviceErrorFunction(impl.device, nullptr, nullptr);
-  if (!error_text.empty()) return absl::UnavailableError(error_text);
+  impl.scene = impl.MakeScene(RTC_SCENE_FLAG_ROBUST, RTC_BUILD_QUALITY_MEDIUM);
+  if (!impl.error_text.empty()) return absl::UnavailableError(impl.error_text);
   return std::shared_ptr<const RayAccel>(std::move(accel));
+}
+
+absl::Status RayAccel::PrepareBundles() const {
+  std::call_once(impl_->loose_once, [this] {
+    const bool split = scene_->triangles().size() <= kMostSplitTriangles;
+    impl_->loose = impl_->MakeScene(RTC_SCENE_FLAG_NONE,
+                                    split ? RTC_BUILD_QUALITY_HIGH : RTC_BUILD_QUALITY_MEDIUM);
+  });
+  if (!impl_->error_text.empty()) return absl::UnavailableError(impl_->error_text);
+  return absl::OkStatus();
 }
 
 std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& direction,
@@ -113,17 +200,24 @@ std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& dire
     record_->push_back({origin, direction, t_max, false});
   RTCRayHit query;
   FillRay(query.ray, origin, direction, t_max);
-  query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
-  query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
-#if RTC_VERSION_MAJOR >= 4
-  rtcIntersect1(impl_->scene, &query);
-#else
-  RTCIntersectContext context;
-  rtcInitIntersectContext(&context);
-  rtcIntersect1(impl_->scene, &context, &query);
-#endif
-  if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return std::nullopt;
-  return RayHit{query.ray.tfar, query.hit.primID, query.hit.u, query.hit.v};
+  if (!Impl::Nearest(impl_->scene, query)) return std::nullopt;
+  return impl_->HitOf(query);
+}
+
+void RayAccel::IntersectBundle(const Vec3f& origin, std::span<const Vec3f> directions,
+                               std::span<RayHit> hits) const {
+  constexpr float kFar = std::numeric_limits<float>::infinity();
+  for (size_t i = 0; i < directions.size(); ++i) {
+    if (record_ != nullptr) [[unlikely]]
+      record_->push_back({origin, directions[i], kFar, false});
+    RTCRayHit query;
+    FillRay(query.ray, origin, directions[i], kFar);
+    if (Impl::Nearest(impl_->loose, query)) {
+      hits[i] = impl_->HitOf(query);
+    } else {
+      hits[i].triangle = kNoTriangle;
+    }
+  }
 }
 
 bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max) const {
@@ -161,14 +255,7 @@ size_t RayAccel::TraceBare(std::span<const TracedRay> rays) const {
     } else {
       RTCRayHit query;
       FillRay(query.ray, r.origin, r.direction, r.t_max);
-      query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
-      query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
-#if RTC_VERSION_MAJOR >= 4
-      rtcIntersect1(impl_->scene, &query);
-#else
-      rtcIntersect1(impl_->scene, &context, &query);
-#endif
-      hits += query.hit.geomID != RTC_INVALID_GEOMETRY_ID;
+      hits += Impl::Nearest(impl_->scene, query);
     }
   }
   return hits;

@@ -24,6 +24,8 @@ enum : uint64_t { kKeyJitter = 21, kKeyGather = 22 };
 constexpr float kCellSide = 1.2f;
 // Levels of the pixels themselves: the records of the first tell the second where light changes.
 constexpr int kPixelLevels = 2;
+// Receivers within a square of so many pixels look through the same records.
+constexpr int kSquare = 8;
 
 PixelRect Grown(const PixelRect& r, int by) { return {r.x0 - by, r.y0 - by, r.x1 + by, r.y1 + by}; }
 float ReachOf(int spacing) {
@@ -193,6 +195,20 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     sum += ReachOf(levels_[l]->spacing);
     margin[l] = static_cast<int>(sum) + 1;
   }
+  // Every pixel is a candidate on the last levels.
+  struct PixelReceivers {
+    PixelRect rect;
+    std::vector<ReceiverPlace> places;  // row by row; footprint_m < 0: background
+  } pixels;
+  const auto pixel_receiver = [&](int x, int y, ReceiverPlace& place) {
+    if (pixels.rect.Contains(x, y)) {
+      place = pixels.places[static_cast<size_t>(y - pixels.rect.y0) *
+                                static_cast<size_t>(pixels.rect.width()) +
+                            static_cast<size_t>(x - pixels.rect.x0)];
+      return place.footprint_m >= 0;
+    }
+    return source_.ReceiverAt(x, y, place.receiver, place.footprint_m);
+  };
   for (size_t l = 0; l < levels_.size(); ++l) {
     Level& level = *levels_[l];
     const int s = level.spacing;
@@ -207,8 +223,7 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
       WorldCell cell;
       ReceiverPlace place;  // of the candidate first, of the cell's own place then
       bool known = false, wanted = false, chosen = false, decided = false;
-      float most_reach_m = std::numeric_limits<float>::infinity();  // by coarser neighbours
-      uint32_t first = 0, end = 0;                                  // its proposers
+      uint32_t first = 0, end = 0;  // its proposers
       std::shared_ptr<const ScreenRecord> record;
     };
     const int c = level.anchored ? std::max(1, s / 2) : 1;  // spacing of candidates
@@ -222,6 +237,9 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
       bool seen = false;
     };
     std::vector<Candidate> candidates(static_cast<size_t>(columns) * static_cast<size_t>(rows));
+    // The first of the levels that look at every pixel looks at the largest part of the frame.
+    const bool keep = c == 1 && pixels.places.empty();
+    std::vector<ReceiverPlace> kept_pixels(keep ? candidates.size() : 0);
     executor.ForEachPiece(candidates.size(), 64, [&](size_t begin, size_t end) {
       for (size_t i = begin; i < end; ++i) {
         const uint64_t column = static_cast<uint64_t>(x0) + i % static_cast<size_t>(columns);
@@ -233,7 +251,16 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
         if (!frame_.Contains(x, y)) continue;
         Candidate& candidate = candidates[i];
         ReceiverPlace& place = candidate.place;
-        if (!source_.ReceiverAt(x, y, place.receiver, place.footprint_m)) continue;
+        const bool hit = pixel_receiver(x, y, place);
+        if (keep) {
+          ReceiverPlace& kept = kept_pixels[i];
+          if (hit) {
+            kept = place;
+          } else {
+            kept.footprint_m = -1;
+          }
+        }
+        if (!hit) continue;
         place.x_px = static_cast<float>(x) + 0.5f;
         place.y_px = static_cast<float>(y) + 0.5f;
         candidate.seen = true;
@@ -247,6 +274,7 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
       }
     });
     counts.candidates += candidates.size();
+    if (keep) pixels = {asked, std::move(kept_pixels)};
     std::erase_if(candidates, [](const Candidate& candidate) { return !candidate.seen; });
     std::stable_sort(candidates.begin(), candidates.end(),
                      [](const Candidate& a, const Candidate& b) { return a.cell < b.cell; });
@@ -270,9 +298,8 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
       }
     }
 
-    // Who needs a record …
+    // Whose place counts …
     executor.ForEachPiece(items.size(), 16, [&](size_t begin, size_t end) {
-      std::vector<const ScreenRecord*> near;
       for (size_t i = begin; i < end; ++i) {
         Item& item = items[i];
         ReceiverPlace& place = item.place;
@@ -297,27 +324,62 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
           if (!close) continue;
         }
         item.wanted = true;
-        if (item.known) continue;
-        item.chosen = true;
-        if (l == 0) continue;
+        item.chosen = !item.known && l == 0;
+      }
+    });
+
+    // … and is served too badly …
+    struct Doubtful {
+      uint64_t square;
+      uint32_t item;
+    };
+    std::vector<Doubtful> doubtful;
+    const auto pixel_of = [](float at) { return static_cast<int>(std::floor(at)); };
+    const auto square_of = [&](float at, int first) {
+      return static_cast<uint32_t>((pixel_of(at) - first) / kSquare);
+    };
+    for (uint32_t i = 0; i < items.size() && l > 0; ++i) {
+      const ReceiverPlace& place = items[i].place;
+      if (!items[i].wanted || items[i].known) continue;
+      doubtful.push_back(
+          {uint64_t{square_of(place.y_px, region.y0)} << 32 | square_of(place.x_px, region.x0), i});
+    }
+    std::sort(doubtful.begin(), doubtful.end(), [](const Doubtful& a, const Doubtful& b) {
+      return a.square != b.square ? a.square < b.square : a.item < b.item;
+    });
+    std::vector<uint32_t> squares;  // their first
+    for (uint32_t i = 0; i < doubtful.size(); ++i) {
+      if (i == 0 || doubtful[i].square != doubtful[i - 1].square) squares.push_back(i);
+    }
+    squares.push_back(static_cast<uint32_t>(doubtful.size()));
+    executor.ForEachPiece(squares.size() - 1, 1, [&](size_t begin, size_t end) {
+      std::vector<const ScreenRecord*> near;
+      for (size_t q = begin; q < end; ++q) {
         near.clear();
-        const int x = static_cast<int>(std::floor(place.x_px));
-        const int y = static_cast<int>(std::floor(place.y_px));
-        view->Collect({x, y, x + 1, y + 1}, near);
-        const ServedReceiver served{&place.receiver, place.x_px, place.y_px};
-        Rgb irradiance;
-        float weight, openness;
-        BlendSpread spread;
-        BlendRecords(near, {&served, 1}, {&irradiance, 1}, {&weight, 1}, {&spread, 1}, {},
-                     {&openness, size_t{params_.spread_open > 0}});
-        const auto above = [](float value, float most) { return most > 0 && value > most; };
-        item.chosen = !(weight >= params_.enough) || above(spread.irradiance, params_.spread_wm2) ||
-                      above(spread.openness, params_.spread_open);
-        item.decided = !item.chosen && level.anchored;
-        for (const ScreenRecord* r : near) {
-          item.most_reach_m =
-              std::min(item.most_reach_m,
-                       r->gather.reach_m + Length(r->gather.position - place.receiver.position));
+        const uint64_t square = doubtful[squares[q]].square;
+        const int x = region.x0 + kSquare * static_cast<int>(square & 0xffffffffu);
+        const int y = region.y0 + kSquare * static_cast<int>(square >> 32);
+        view->Collect({x, y, x + kSquare, y + kSquare}, near);
+        for (uint32_t at = squares[q]; at < squares[q + 1]; at += 8) {
+          const size_t count = std::min<size_t>(8, squares[q + 1] - at);
+          ServedReceiver served[8];
+          for (size_t i = 0; i < count; ++i) {
+            const ReceiverPlace& place = items[doubtful[at + i].item].place;
+            served[i] = {&place.receiver, place.x_px, place.y_px};
+          }
+          Rgb irradiance[8];
+          float weight[8], openness[8];
+          BlendSpread spread[8];
+          BlendRecords(near, {served, count}, {irradiance, count}, {weight, count}, {spread, count},
+                       {}, {openness, params_.spread_open > 0 ? count : 0});
+          const auto above = [](float value, float most) { return most > 0 && value > most; };
+          for (size_t i = 0; i < count; ++i) {
+            Item& item = items[doubtful[at + i].item];
+            item.chosen = !(weight[i] >= params_.enough) ||
+                          above(spread[i].irradiance, params_.spread_wm2) ||
+                          above(spread[i].openness, params_.spread_open);
+            item.decided = !item.chosen && level.anchored;
+          }
         }
       }
     });
@@ -332,6 +394,16 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     executor.ForEach(made.size(), 1, [&](size_t i) {
       if (stopped.load(std::memory_order_relaxed)) return;
       Item& item = items[made[i]];
+      // By coarser neighbours.
+      float most_reach_m = std::numeric_limits<float>::infinity();
+      std::vector<const ScreenRecord*> near;
+      const int x = pixel_of(item.place.x_px), y = pixel_of(item.place.y_px);
+      view->Collect({x, y, x + 1, y + 1}, near);
+      for (const ScreenRecord* r : near) {
+        most_reach_m =
+            std::min(most_reach_m,
+                     r->gather.reach_m + Length(r->gather.position - item.place.receiver.position));
+      }
       auto record = std::make_shared<ScreenRecord>();
       record->x_px = item.place.x_px;
       record->y_px = item.place.y_px;
@@ -343,7 +415,7 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
                          : CellOf(item.place.receiver, item.place.footprint_m, params_.seed);
       g = source_.Gather(item.place.receiver, level.grid,
                          HashKey(HashOf(cell, params_.seed), kKeyGather, static_cast<uint64_t>(l)));
-      SetReach(item.place.footprint_m, item.most_reach_m, *record);
+      SetReach(item.place.footprint_m, most_reach_m, *record);
       item.record = std::move(record);
       const double part = static_cast<double>(++done) / static_cast<double>(made.size());
       if (go_on && !go_on((static_cast<double>(l) + part) / static_cast<double>(levels_.size()))) {

@@ -59,8 +59,8 @@ struct HierarchyParams {
   uint32_t coarsest_samples = 1024;  // strata of a record of level 0; those of level l are
   float fall_off = 0.35f;            // (s_l / s_0)^fall_off times as many, at least
   uint32_t least_samples = 64;
-  float reach = 0.15f;   // a over the harmonic mean distance
-  float enough = 0.25f;  // summed weight that spares a receiver a record of its own
+  float reach = 0.18f;   // a over the harmonic mean distance
+  float enough = 0.15f;  // summed weight that spares a receiver a record of its own
   float floor_px = 3;    // least a, in pixels' footprints, see above
   // Standard deviation among records that spares a receiver a record of its own, W/m², mean of the
   // channels, and of openness; 0: any does.

@@ -1,6 +1,7 @@
 #include "core/pbgi/surfel_atlas.h"
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <bit>
 #include <cmath>
@@ -69,7 +70,10 @@ SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
     uint64_t end = i;
     while (end < n && order[end].key == order[i].key) {
       const uint32_t slot = order[end].slot;
-      entries_[end] = {tree.surfel(slot).position, slot};
+      const Surfel s = tree.surfel(slot);
+      const RadianceSides l = tree.radiance_of(slot);
+      entries_[end] = {s.position, slot, s.normal, l.front.x + l.front.y + l.front.z,
+                       l.back.x + l.back.y + l.back.z};
       ++end;
     }
     size_t at = Mix64(order[i].key) & (size - 1);
@@ -108,30 +112,42 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
   float darkest[2] = {std::numeric_limits<float>::infinity(),
                       std::numeric_limits<float>::infinity()};
   float brightest[2] = {0, 0};
-  for (int i = 0; i < 8; ++i) {
-    const Cell* cell = FindCell(KeyOf(x0 + (i & 1), y0 + (i >> 1 & 1), z0 + (i >> 2)));
+  // The fetches from memory overlap.
+  std::array<uint64_t, 8> keys;
+  std::array<const Cell*, 8> cells;
+  for (size_t i = 0; i < 8; ++i) {
+    keys[i] = KeyOf(x0 + static_cast<int64_t>(i & 1), y0 + static_cast<int64_t>(i >> 1 & 1),
+                    z0 + static_cast<int64_t>(i >> 2));
+    __builtin_prefetch(&cells_[Mix64(keys[i]) & (cells_.size() - 1)]);
+  }
+  for (size_t i = 0; i < 8; ++i) {
+    cells[i] = FindCell(keys[i]);
+    if (cells[i] == nullptr) continue;
+    const char* entries = reinterpret_cast<const char*>(&entries_[cells[i]->first]);
+    for (size_t at = 0; at < cells[i]->count * sizeof(Entry); at += 64) {
+      __builtin_prefetch(entries + at);
+    }
+  }
+  for (const Cell* cell : cells) {
     if (cell == nullptr) continue;
     for (uint32_t e = cell->first; e < cell->first + cell->count; ++e) {
-      const float d2 = Length2(entries_[e].position - p);
+      const Entry& entry = entries_[e];
+      const Vec3f d = p - entry.position;
+      const float d2 = Length2(d);
       if (!(d2 < farthest)) continue;
-      const uint32_t slot = entries_[e].slot;
-      const Vec3f m = tree_.surfel(slot).normal;
-      const float cosine = m.x * n.x + m.y * n.y + m.z * n.z;
+      const float cosine = Dot(entry.normal, n);
       if (!(std::fabs(cosine) > kSameSurfaceCosine)) continue;
-      const Vec3f d = p - entries_[e].position;
-      const float off = m.x * d.x + m.y * d.y + m.z * d.z;
-      if (!(std::fabs(off) <= kSamePlane * spacing_m_)) continue;
+      if (!(std::fabs(Dot(entry.normal, d)) <= kSamePlane * spacing_m_)) continue;
       const int turned = cosine > 0.0f ? 0 : 1;
       if (d2 < spacing_m_ * spacing_m_) {
-        const Rgb l = tree_.radiance_of(slot, front == (turned == 0));
-        const float sum = l.x + l.y + l.z;
+        const float sum = front == (turned == 0) ? entry.front : entry.back;
         darkest[turned] = std::min(darkest[turned], sum);
         brightest[turned] = std::max(brightest[turned], sum);
       }
       if (!(d2 < best[turned])) continue;
       best[turned] = d2;
-      found[turned] = slot;
-      place[turned] = entries_[e].position;
+      found[turned] = entry.slot;
+      place[turned] = entry.position;
     }
   }
   const int turned = found[0] != ~0u ? 0 : 1;
@@ -208,10 +224,12 @@ SurfelAtlas::SurfelAtlas(const RayAccel& accel, const PointTree& tree)
   words_.reset(static_cast<uint64_t*>(std::calloc(2 * total, sizeof(uint64_t))));
 }
 
-uint64_t SurfelAtlas::Resolve(uint32_t triangle, uint32_t column, uint32_t row, uint32_t side,
-                              bool front) const {
+uint64_t SurfelAtlas::Resolve(const Point& point, const Texel& texel, uint32_t side) const {
+  const auto [column, row, word] = texel;
+  const uint32_t triangle = point.triangle;
+  const bool front = point.front;
   // Column + row < side: the texel's lower half lies in the triangle; else the texel is the mirror
-  // image of one that does (see Radiance), whose upper half it is.
+  // image of one that does (see TexelOf), whose upper half it is.
   const bool upper = column + row >= side;
   const float inverse = 1.0f / static_cast<float>(side);
   const float u = static_cast<float>(upper ? side - 1 - column : column);
@@ -247,12 +265,10 @@ uint64_t SurfelAtlas::Resolve(uint32_t triangle, uint32_t column, uint32_t row, 
   return Encode(*found);
 }
 
-std::optional<Rgb> SurfelAtlas::Radiance(uint32_t triangle, float b1, float b2, bool front) const {
-  if (!words_) return std::nullopt;
-  const Patch patch = patches_[triangle];
+SurfelAtlas::Texel SurfelAtlas::TexelOf(const Point& point, const Patch& patch) const {
   const uint32_t side = static_cast<uint32_t>(patch.side);
   const float scale = static_cast<float>(side);
-  const float u = std::max(b1, 0.0f) * scale, v = std::max(b2, 0.0f) * scale;
+  const float u = std::max(point.b1, 0.0f) * scale, v = std::max(point.b2, 0.0f) * scale;
   uint32_t column = std::min(static_cast<uint32_t>(u), side - 1);
   uint32_t row = std::min(static_cast<uint32_t>(v), side - 1);
   // Micro-triangles: the lower left half of cell (column, row) keeps the cell's place, the upper
@@ -266,15 +282,42 @@ std::optional<Rgb> SurfelAtlas::Radiance(uint32_t triangle, float b1, float b2, 
     column = side - 1 - column;
     row = side - 1 - row;
   }
-  uint64_t& word = words_[2 * (patch.first + uint64_t{row} * side + column) + (front ? 0 : 1)];
-  const std::atomic_ref<uint64_t> cell(word);
+  return {column, row, 2 * (patch.first + uint64_t{row} * side + column) + (point.front ? 0u : 1u)};
+}
+
+uint64_t SurfelAtlas::Value(const Point& point, const Texel& texel, uint32_t side) const {
+  const std::atomic_ref<uint64_t> cell(words_[texel.word]);
   uint64_t value = cell.load(std::memory_order_relaxed);
   if (value == 0) {
-    value = Resolve(triangle, column, row, side, front);
+    value = Resolve(point, texel, side);
     cell.store(value, std::memory_order_relaxed);
   }
-  if ((value & kNone) != 0) return std::nullopt;
-  return Decode(value);
+  return value;
+}
+
+std::optional<Rgb> SurfelAtlas::Radiance(const Point& point) const {
+  Rgb radiance;
+  if (Radiances({&point, 1}, {&radiance, 1}) == 0) return std::nullopt;
+  return radiance;
+}
+
+uint64_t SurfelAtlas::Radiances(std::span<const Point> points, std::span<Rgb> radiance) const {
+  if (!words_) return 0;
+  for (const Point& point : points) __builtin_prefetch(&patches_[point.triangle]);
+  std::array<Texel, kTogether> texels;
+  for (size_t i = 0; i < points.size(); ++i) {
+    texels[i] = TexelOf(points[i], patches_[points[i].triangle]);
+    __builtin_prefetch(&words_[texels[i].word]);
+  }
+  uint64_t found = 0;
+  for (size_t i = 0; i < points.size(); ++i) {
+    const auto side = static_cast<uint32_t>(patches_[points[i].triangle].side);
+    const uint64_t value = Value(points[i], texels[i], side);
+    if ((value & kNone) != 0) continue;
+    radiance[i] = Decode(value);
+    found |= uint64_t{1} << i;
+  }
+  return found;
 }
 
 }  // namespace farpoint

@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <memory>
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "core/accel/ray_accel.h"
@@ -34,9 +35,12 @@ class SurfelGrid {
   float spacing_m() const { return spacing_m_; }
 
  private:
+  // What a search looks at, side by side.
   struct Entry {
     Vec3f position;
     uint32_t slot;
+    Vec3f normal;
+    float front, back;  // the sum of the radiance's channels
   };
   struct Cell {
     uint64_t key = kEmpty;
@@ -61,11 +65,21 @@ class SurfelAtlas {
   // surfels).
   SurfelAtlas(const RayAccel& accel, const PointTree& tree);
 
-  // The radiance at the point (b1, b2) of `triangle` on the side of its front (winding) or back, as
-  // SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits below the largest channel.
-  // None, too, where something stands on the texel, or between it and the surfel: the light on its
-  // other side is another.
-  std::optional<Rgb> Radiance(uint32_t triangle, float b1, float b2, bool front) const;
+  // The point (b1, b2) of `triangle`, on the side of its front (winding) or back.
+  struct Point {
+    uint32_t triangle;
+    float b1, b2;
+    bool front;
+  };
+  // The radiance at a point, as SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits
+  // below the largest channel. None, too, where something stands on the texel, or between it and
+  // the surfel: the light on its other side is another.
+  std::optional<Rgb> Radiance(const Point& point) const;
+  // The same of up to kTogether points, whose fetches from memory overlap: bit i is set where there
+  // is one at points[i].
+  uint64_t Radiances(std::span<const Point> points, std::span<Rgb> radiance) const;
+
+  static constexpr size_t kTogether = 64;
 
   float spacing_m() const { return grid_.spacing_m(); }
 
@@ -78,8 +92,14 @@ class SurfelAtlas {
   struct Patch {
     uint64_t first : 40, side : 24;  // side² texels from `first`
   };
-  uint64_t Resolve(uint32_t triangle, uint32_t column, uint32_t row, uint32_t side,
-                   bool front) const;
+  struct Texel {
+    uint32_t column, row;
+    uint64_t word;  // index into words_
+  };
+  Texel TexelOf(const Point& point, const Patch& patch) const;
+  uint64_t Resolve(const Point& point, const Texel& texel, uint32_t side) const;
+  // The word, resolved if need be.
+  uint64_t Value(const Point& point, const Texel& texel, uint32_t side) const;
 
   const RayAccel& accel_;
   const PreparedScene& scene_;

@@ -96,9 +96,11 @@ Digest GeometryKey(const Scene& scene, const PreparedScene& prepared) {
   return hash.Finish();
 }
 
-float SpacingFor(const RenderSettings& settings, double area_m2, float diagonal_m) {
-  return settings.points != 0 ? SurfelSpacingM(area_m2, settings.points)
-                              : DefaultSurfelSpacingM(area_m2, diagonal_m);
+float SpacingFor(const RenderSettings& settings, double area_m2, const PreparedScene& prepared) {
+  if (settings.points != 0) return SurfelSpacingM(area_m2, settings.points);
+  // A map may hold a sun.
+  const bool sharp = !prepared.lights().empty() || prepared.has_environment_map();
+  return DefaultSurfelSpacingM(area_m2, prepared.diagonal_m(), sharp);
 }
 
 // The stages after the prepared scene.
@@ -152,7 +154,7 @@ class TreeBake {
     shapes_ = MakeObjectShapes(scene_, *prepared_, executor_);
     spacing_m_ = options_.surfel_spacing_m > 0
                      ? options_.surfel_spacing_m
-                     : SpacingFor(settings_, TotalAreaM2(shapes_), prepared_->diagonal_m());
+                     : SpacingFor(settings_, TotalAreaM2(shapes_), *prepared_);
     if (spacing_m_ > 0) {
       samplers_.resize(shapes_.size());
       executor_.ForEach(shapes_.size(), 1, [&](size_t i) {
@@ -296,8 +298,7 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
 absl::StatusOr<float> SurfelSpacing(const Scene& scene, const RenderSettings& settings,
                                     Executor& executor) {
   FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(scene, executor));
-  return SpacingFor(settings, TotalAreaM2(MakeObjectShapes(scene, *prepared, executor)),
-                    prepared->diagonal_m());
+  return SpacingFor(settings, TotalAreaM2(MakeObjectShapes(scene, *prepared, executor)), *prepared);
 }
 
 }  // namespace farpoint

@@ -32,8 +32,8 @@ namespace {
 constexpr float kServed = 0.02f;
 
 // Standard deviation among the records at a receiver that asks for one more, in parts of the
-// frame's mean irradiance.
-constexpr float kMostSpread = 0.15f;
+// frame's mean irradiance. Records of a draft disagree by their noise already.
+constexpr float kMostSpread = 0.15f, kMostDraftSpread = 0.4f;
 // The same of the sky's light, in parts of it and the indirect light: shadows have edges.
 constexpr float kMostOpenSpread = 0.05f;
 
@@ -86,23 +86,24 @@ struct Sample {
   float openness = 0;              // as they blend it, if the sky's light comes from them
 };
 
-// The parameters of adaptive clusters, measured in docs/decisions/0015-adaptive-clusters.md.
+// The parameters of adaptive clusters, measured in docs/decisions/0015-adaptive-clusters.md and
+// 0024-faster-gather.md.
 HierarchyParams HierarchyOf(const RenderSettings& settings) {
   HierarchyParams p;
   p.seed = settings.seed;
   switch (settings.quality) {
     case Quality::kDraft:
       p.coarsest_samples = 512;
-      p.fall_off = 0.5f;
-      p.reach = 0.25f;
-      p.enough = 0.1f;
-      p.floor_px = 6;
+      p.reach = 0.35f;
+      p.enough = 0.05f;
       break;
     case Quality::kNormal:
       break;
     case Quality::kFine:
       p.coarsest_samples = 2048;
       p.fall_off = 0.25f;
+      p.reach = 0.15f;
+      p.enough = 0.25f;
       p.floor_px = 1;
       break;
   }
@@ -119,7 +120,7 @@ float NoiseOf(const RenderSettings& settings) {
     case Quality::kFine:
       return 0.002f;
   }
-  return 0.003f;
+  return 0.004f;
 }
 
 IrradianceCacheParams CacheOf(const RenderSettings& settings) {
@@ -203,7 +204,8 @@ class Renderer final : public FrameRenderer {
       std::call_once(scaled_, [&] {
         const RecordGatherer::Means mean = gatherer_->MeanOf(frame_.film.frame(), executor);
         HierarchyParams params = HierarchyOf(settings_);
-        params.spread_wm2 = kMostSpread * mean.irradiance;
+        const bool draft = settings_.quality == Quality::kDraft;
+        params.spread_wm2 = (draft ? kMostDraftSpread : kMostSpread) * mean.irradiance;
         const float noise = NoiseOf(settings_);
         RecordGatherer::Means deviation{noise * mean.irradiance, 0};
         if (sky_by_records_) {
@@ -931,6 +933,11 @@ absl::StatusOr<std::unique_ptr<FrameRenderer>> FrameRenderer::Create(
   if (frame.settings.point_based() && static_cast<const LoadedSceneData&>(*scene).tree == nullptr) {
     return absl::FailedPreconditionError(
         "a point-based integrator needs a point tree, and the scene was baked without one");
+  }
+  const Integrator integrator = frame.settings.integrator;
+  if ((integrator == Integrator::kFpbgi || integrator == Integrator::kIrrcache) &&
+      frame.settings.fill_in_force() == Fill::kRays) {
+    FP_RETURN_IF_ERROR(static_cast<const LoadedSceneData&>(*scene).accel->PrepareBundles());
   }
   return std::unique_ptr<FrameRenderer>(std::make_unique<Renderer>(std::move(scene), frame));
 }

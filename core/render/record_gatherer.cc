@@ -1,12 +1,15 @@
 #include "core/render/record_gatherer.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <limits>
 #include <span>
 
 #include "core/base/clock.h"
 #include "core/math/sampling.h"
 #include "core/pbgi/microbuffer.h"
+#include "core/render/ray_hits.h"
 
 namespace farpoint {
 
@@ -19,6 +22,8 @@ constexpr uint32_t kMostExtraRays = 32;
 // The receivers that say how bright a frame is: one for so many pixels, within bounds.
 constexpr int kPixelsPerPilot = 256, kLeastPilots = 16, kMostPilots = 256;
 constexpr uint32_t kPilotSamples = 128;
+// Rays that bring more than so many times the mean of their record are traced again, watertight.
+constexpr float kOdd = 16.0f;
 enum : uint64_t { kKeyDirections = 31, kKeyLight = 32, kKeyPilot = 33, kKeyPilotGather = 34 };
 
 // What one receiver sees along rays.
@@ -32,47 +37,126 @@ class HitReader {
         origin_(scene.accel->LeaveSurface(receiver.position, receiver.geometric_normal)),
         light_key_(light_key) {}
 
-  // The reflected radiance that arrives along -w and 1 / the distance, 0: nothing there.
-  // `index` tells the ray from the others.
-  Rgb Read(const Vec3f& w, uint32_t index, float& inverse_distance) {
-    const PreparedScene& scene = *scene_.scene;
-    ++rays;
-    inverse_distance = 0;
-    const std::optional<RayHit> hit = scene_.accel->Intersect(origin_, w);
-    if (!hit) return {};
-    // A hit at the origin itself has no distance: as near as the offset that the ray took.
-    const float t = std::max(hit->t, scene_.accel->surface_offset_m());
-    inverse_distance = 1.0f / t;
-    Vec3f ng = scene.GeometricNormal(hit->triangle);
-    const bool front = !(Dot(ng, w) > 0.0f);
-    if (!front) ng = -ng;
-    if (atlas_ != nullptr && t > near_m_) {
-      const std::optional<Rgb> radiance = atlas_->Radiance(hit->triangle, hit->b1, hit->b2, front);
-      if (radiance) {
-        ++read;
-        return *radiance;
-      }
+  // Rays to be read together: up to kRaysTogether.
+  struct Rays {
+    uint32_t count = 0;
+    std::array<Vec3f, kRaysTogether> direction;
+    std::array<uint32_t, kRaysTogether> index;  // tells a ray from the receiver's others
+    std::array<uint32_t, kRaysTogether> stratum;
+    // Results: the reflected radiance that arrives against the direction and 1 / the distance,
+    // 0: nothing there.
+    std::array<Rgb, kRaysTogether> radiance;
+    std::array<float, kRaysTogether> inverse_distance;
+
+    void Add(const Vec3f& w, uint32_t ray_index, uint32_t of) {
+      direction[count] = w;
+      index[count] = ray_index;
+      stratum[count++] = of;
     }
-    const SurfaceSample surface = scene.Surface(hit->triangle, hit->b1, hit->b2);
-    if (!(MaxComponent(surface.albedo) > 0.0f)) return {};
-    ++shaded;
-    Vec3f ns = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2);
-    if (!front) ns = -ns;
-    const Vec3f y = scene.PointOn(hit->triangle, hit->b1, hit->b2);
-    const Rgb e = scene_.lights->Irradiance(y, ng, ns, 1, light_key_, index, 2, counters);
-    return surface.albedo * e * kInvPif;
+  };
+
+  void Read(Rays& rays) {
+    std::array<RayHit, kRaysTogether> hits;
+    traced += rays.count;
+    scene_.accel->IntersectBundle(origin_, std::span(rays.direction).first(rays.count), hits);
+    Read(rays, hits);
+  }
+
+  // Again one ray that may have slipped between two triangles.
+  void ReadAgain(Rays& rays, uint32_t i) {
+    ++traced;
+    ++again;
+    std::array<RayHit, kRaysTogether> hits;
+    Rays one;
+    one.Add(rays.direction[i], rays.index[i], rays.stratum[i]);
+    const std::optional<RayHit> hit = scene_.accel->Intersect(origin_, one.direction[0]);
+    hits[0].triangle = kNoTriangle;
+    if (hit) hits[0] = *hit;
+    Read(one, hits);
+    rays.radiance[i] = one.radiance[0];
+    rays.inverse_distance[i] = one.inverse_distance[0];
   }
 
   LightCounters counters;
-  uint64_t rays = 0, read = 0, shaded = 0;
+  uint64_t traced = 0, again = 0, read = 0, shaded = 0;
 
  private:
+  void Read(Rays& rays, std::span<const RayHit> hits) {
+    // What lies far brings its surfel's radiance …
+    std::array<SurfelAtlas::Point, kRaysTogether> far;
+    std::array<uint32_t, kRaysTogether> far_ray;
+    uint32_t far_count = 0;
+    RayHits near;
+    const auto shade = [&](uint32_t i) {
+      const uint32_t k = near.count++;
+      near.ray[k] = i;
+      near.index[k] = rays.index[i];
+      near.triangle[k] = hits[i].triangle;
+      near.b1[k] = hits[i].b1;
+      near.b2[k] = hits[i].b2;
+      near.direction.Set(k, rays.direction[i]);
+    };
+    for (uint32_t i = 0; i < rays.count; ++i) {
+      rays.radiance[i] = Rgb();
+      rays.inverse_distance[i] = 0;
+      const RayHit& hit = hits[i];
+      if (hit.triangle == kNoTriangle) continue;
+      // A hit at the origin itself has no distance: as near as the offset that the ray took.
+      const float t = std::max(hit.t, scene_.accel->surface_offset_m());
+      rays.inverse_distance[i] = 1.0f / t;
+      if (atlas_ != nullptr && t > near_m_) {
+        far_ray[far_count] = i;
+        far[far_count++] = {hit.triangle, hit.b1, hit.b2, hit.front};
+      } else {
+        shade(i);
+      }
+    }
+    if (far_count > 0) {
+      std::array<Rgb, kRaysTogether> radiance;
+      const uint64_t found = atlas_->Radiances(std::span(far).first(far_count), radiance);
+      for (uint32_t k = 0; k < far_count; ++k) {
+        if ((found >> k & 1) != 0) {
+          ++read;
+          rays.radiance[far_ray[k]] = radiance[k];
+        } else {
+          shade(far_ray[k]);
+        }
+      }
+    }
+    // … and the rest is shaded.
+    const PreparedScene& scene = *scene_.scene;
+    KeepWhatReflects(scene, near);
+    if (near.count == 0) return;
+    shaded += near.count;
+    std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
+    std::array<V8, kRaysTogether / kHitLanes> irradiance;
+    const size_t groups = (near.count + kHitLanes - 1) / kHitLanes;
+    for (uint32_t g = 0; g < groups; ++g) {
+      points[g] = SurfaceAt(near, g * kHitLanes);
+      points[g].active = (1u << std::min(kHitLanes, near.count - g * kHitLanes)) - 1u;
+    }
+    scene_.lights->IrradianceEach(std::span(points).first(groups), light_key_, 2,
+                                  std::span(irradiance).first(groups), counters);
+    for (uint32_t k = 0; k < near.count; ++k) {
+      const Rgb arriving = irradiance[k / kHitLanes].Lane(k % kHitLanes);
+      // Textures are looked up where light arrives only.
+      if (!(MaxComponent(arriving) > 0.0f)) continue;
+      const Rgb albedo = scene.Surface(near.triangle[k], near.b1[k], near.b2[k]).albedo;
+      rays.radiance[near.ray[k]] = albedo * arriving * kInvPif;
+    }
+  }
+
   const LoadedSceneData& scene_;
   const SurfelAtlas* const atlas_;
   const float near_m_;
   const Vec3f origin_;
   const uint64_t light_key_;
 };
+
+float Grey(const Rgb& c) { return (c.x + c.y + c.z) * (1.0f / 3); }
+float GreyAt(const HemisphereSamples& samples, size_t at) {
+  return (samples.radiance(0)[at] + samples.radiance(1)[at] + samples.radiance(2)[at]) * (1.0f / 3);
+}
 
 // The standard deviation of `value`, an array of grid.padded() elements, among the up to eight
 // neighbours of each stratum, squared and times `scale`², is added to `squares_out`. The first and
@@ -116,8 +200,7 @@ std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSampl
   if (least_share.irradiance > 0) {
     std::vector<float> grey(grid.padded());
     for (size_t at = 0; at < grey.size(); ++at) {
-      grey[at] = (samples.radiance(0)[at] + samples.radiance(1)[at] + samples.radiance(2)[at]) *
-                 (1.0f / 3);
+      grey[at] = GreyAt(samples, at);
     }
     AddVariance(grid, grey, each / least_share.irradiance, squares);
   }
@@ -257,54 +340,101 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
   const uint64_t directions_key = HashKey(key, kKeyDirections);
   grid.Directions(directions_key, samples.direction(0), samples.direction(1), samples.direction(2));
   HitReader reader(scene_, atlas_, near_m_, receiver, HashKey(key, kKeyLight));
+  HitReader::Rays rays;
+  // Reads the rays, once again those that bring so much more than the others that one which slipped
+  // between two triangles would show, and hands them to `take`.
+  float odd = 0;
+  bool odd_misses = false;
+  const auto flush = [&](const auto& take) {
+    reader.Read(rays);
+    for (uint32_t i = 0; i < rays.count; ++i) {
+      if (Grey(rays.radiance[i]) > odd || (odd_misses && rays.inverse_distance[i] == 0)) {
+        reader.ReadAgain(rays, i);
+      }
+      take(i);
+    }
+    rays.count = 0;
+  };
+  const auto first = [&](uint32_t i) {
+    const size_t at = rays.stratum[i];
+    for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = rays.radiance[i][c];
+    samples.inverse_distance()[at] = rays.inverse_distance[i];
+    if (sees_sky_ && rays.inverse_distance[i] == 0) samples.radiance(3)[at] = 1;
+  };
+  const auto direction_of = [&](size_t at) {
+    return frame.ToWorld(
+        {samples.direction(0)[at], samples.direction(1)[at], samples.direction(2)[at]});
+  };
+  odd = std::numeric_limits<float>::infinity();
   for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
     for (uint32_t sector = 0; sector < grid.sectors(); ++sector) {
-      const size_t at = size_t{ring} * grid.stride() + sector;
-      const Vec3f w = frame.ToWorld(
-          {samples.direction(0)[at], samples.direction(1)[at], samples.direction(2)[at]});
+      const uint32_t at = ring * grid.stride() + sector;
+      const Vec3f w = direction_of(at);
       // Directions that the shading normal allows and the surface does not carry nothing.
       if (!(Dot(w, receiver.geometric_normal) > 0.0f)) {
         samples.inverse_distance()[at] = -1;
         continue;
       }
-      const Rgb radiance =
-          reader.Read(w, static_cast<uint32_t>(at), samples.inverse_distance()[at]);
-      for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = radiance[c];
-      if (sees_sky_ && samples.inverse_distance()[at] == 0) samples.radiance(3)[at] = 1;
+      rays.Add(w, at, at);
+      if (rays.count == kRaysTogether) flush(first);
     }
   }
+  flush(first);
+  double sum = 0, misses = 0;
+  for (size_t at = 0; at < grid.padded(); ++at) {
+    sum += static_cast<double>(GreyAt(samples, at));
+    misses += static_cast<double>(samples.radiance(3)[at]);
+  }
+  odd = static_cast<float>(kOdd * sum / grid.size());
+  odd_misses = misses * kOdd < grid.size();
+  for (uint32_t at = 0; at < grid.padded(); ++at) {
+    if (GreyAt(samples, at) > odd || (odd_misses && samples.radiance(3)[at] > 0)) {
+      rays.Add(direction_of(at), at, at);
+      samples.radiance(3)[at] = 0;
+      reader.ReadAgain(rays, 0);
+      first(0);
+      rays.count = 0;
+    }
+  }
+
   uint64_t refined = 0;
   if (least_share_.irradiance > 0 || least_share_.openness > 0) {
     const std::vector<uint8_t> extra = ExtraRays(grid, samples, least_share_);
     alignas(32) float x[kMostExtraRays], y[kMostExtraRays], z[kMostExtraRays];
+    const auto add = [&](uint32_t i) {
+      const size_t at = rays.stratum[i];
+      for (int c = 0; c < 3; ++c) samples.radiance(c)[at] += rays.radiance[i][c];
+      samples.inverse_distance()[at] += rays.inverse_distance[i];
+      if (sees_sky_ && rays.inverse_distance[i] == 0) samples.radiance(3)[at] += 1;
+    };
     for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
       for (uint32_t sector = 0; sector < grid.sectors(); ++sector) {
-        const size_t at = size_t{ring} * grid.stride() + sector;
+        const uint32_t at = ring * grid.stride() + sector;
         if (extra[at] == 0) continue;
         ++refined;
         grid.DirectionsIn(ring, sector, directions_key, 1, extra[at], x, y, z);
-        Rgb sum(samples.radiance(0)[at], samples.radiance(1)[at], samples.radiance(2)[at]);
-        float inverse_sum = samples.inverse_distance()[at], open = samples.radiance(3)[at];
         for (uint32_t i = 0; i < extra[at]; ++i) {
           const Vec3f w = frame.ToWorld({x[i], y[i], z[i]});
           if (!(Dot(w, receiver.geometric_normal) > 0.0f)) continue;
-          float inverse;
-          sum += reader.Read(w, static_cast<uint32_t>((i + 1) * grid.padded() + at), inverse);
-          inverse_sum += inverse;
-          if (sees_sky_ && inverse == 0) open += 1;
+          rays.Add(w, (i + 1) * grid.padded() + at, at);
+          if (rays.count == kRaysTogether) flush(add);
         }
-        const float share = 1.0f / static_cast<float>(extra[at] + 1);
-        for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = sum[c] * share;
-        samples.inverse_distance()[at] = inverse_sum * share;
-        samples.radiance(3)[at] = open * share;
       }
+    }
+    flush(add);
+    for (size_t at = 0; at < grid.padded(); ++at) {
+      if (extra[at] == 0) continue;
+      const float share = 1.0f / static_cast<float>(extra[at] + 1);
+      for (int c = 0; c < 4; ++c) samples.radiance(c)[at] *= share;
+      samples.inverse_distance()[at] *= share;
     }
   }
   const GatherRecord record = MakeGatherRecord(grid, samples, receiver.position, frame);
   const std::lock_guard lock(mutex_);
   stats_.seconds[static_cast<int>(Stage::kTrace)] += ThreadCpuSeconds() - start;
-  stats_.counts["rays"] += reader.rays + reader.counters.rays;
-  stats_.counts["gather_rays"] += reader.rays;
+  stats_.counts["rays"] += reader.traced + reader.counters.rays;
+  stats_.counts["gather_rays"] += reader.traced;
+  stats_.counts["rays_again"] += reader.again;
   stats_.counts["strata_refined"] += refined;
   stats_.counts["hits_shaded"] += reader.shaded;
   stats_.skipped["hits_read_from_surfels"] += reader.read;

@@ -56,5 +56,43 @@ TEST(Leak, ADarkRoomBehindASheetStaysDark) {
   }
 }
 
+// A closed ball of many triangles under a sky, seen from within. Rays of a bundle slip out of it,
+// one in half a million or so, and must not bring the sky in.
+TEST(Leak, ADarkBallOfManyTrianglesUnderASkyIsBlack) {
+  Mesh mesh;
+  constexpr int kRings = 200, kSegments = 2 * kRings;
+  for (int i = 0; i <= kRings; ++i) {
+    for (int j = 0; j < kSegments; ++j) {
+      const SinCos t = DetSinCos(kPi * i / kRings), p = DetSinCos(2 * kPi * j / kSegments);
+      const double r = i == 0 || i == kRings ? 0.0 : t.sin;
+      mesh.positions.push_back(Vec3f(Vec3d(r * p.cos, t.cos, r * p.sin) * 3.3));
+    }
+  }
+  const auto at = [&](int i, int j) {
+    return static_cast<uint32_t>(i * kSegments + j % kSegments);
+  };
+  for (int i = 0; i < kRings; ++i) {
+    for (int j = 0; j < kSegments; ++j) {
+      if (i > 0) mesh.triangles.push_back({at(i, j), at(i, j + 1), at(i + 1, j)});
+      if (i + 1 < kRings) {
+        mesh.triangles.push_back({at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)});
+      }
+    }
+  }
+  Scene scene;
+  AddLambert(scene, std::move(mesh), 0.8f);
+  scene.environment.sky = Rgb(1000, 1000, 1000);
+  RenderSettings s;
+  s.quality = Quality::kFine;
+  s.points = 20000;
+  s.layers = {Layer::kIrradiance, Layer::kDirectIrradiance};
+  const Rendered image = RenderScene(scene, LookAt({0.1, -0.2, 0.3}, {1, 0.3, 0.2}, {0, 1, 0}, 100),
+                                     Whole(640, 640), s);
+  EXPECT_GT(image.stats.counts.at("gather_rays"), 3'000'000u);
+  for (const Layer layer : s.layers) {
+    for (const float v : image.film.Plane(layer, 0)) ASSERT_EQ(v, 0.0f) << InfoOf(layer).name;
+  }
+}
+
 }  // namespace
 }  // namespace farpoint

@@ -3,6 +3,8 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <array>
+#include <cmath>
 #include <string>
 #include <utility>
 #include <vector>
@@ -355,6 +357,52 @@ TEST(RayAccel, DistanceIsInUnitsOfTheDirectionAndBoundedByTMax) {
   // Nothing behind the origin is hit.
   EXPECT_FALSE(accel->Intersect({0.25f, 0.125f, 5}, {0, 0, 1}).has_value());
   EXPECT_FALSE(accel->Occluded({0.25f, 0.125f, 5}, {0, 0, 1}));
+}
+
+TEST(RayAccel, ABundleMeetsWhatItsRaysMeetAlone) {
+  // Half masked quads amid a soup, and something opaque before and after them in the order.
+  Scene scene = MaskedLayers(3, false);
+  Mesh soup = MakeSoup(3000, 0.15, 77).meshes[0];
+  soup.material = 0;
+  for (Vec3f& p : soup.positions) p.z += 1.5f;
+  scene.instances.push_back({"soup", static_cast<uint32_t>(scene.meshes.size()), {}});
+  scene.meshes.push_back(std::move(soup));
+  const auto accel = BuildAccel(scene);
+  ASSERT_TRUE(accel->scene().has_alpha_masks());
+  ASSERT_TRUE(accel->PrepareBundles().ok());
+  TestRandom random(5);
+  uint64_t hits = 0, different = 0, on_masks = 0;
+  constexpr uint64_t kBundles = 500, kRays = 40;
+  for (uint64_t i = 0; i < kBundles; ++i) {
+    const Vec3f origin(Vec3d(random.Uniform(-1, 1), random.Uniform(-1, 1), random.Uniform(-1, 1)));
+    std::array<Vec3f, kRays> directions;
+    std::array<RayHit, kRays> got;
+    for (Vec3f& w : directions) w = Vec3f(random.Direction());
+    accel->IntersectBundle(origin, directions, got);
+    for (size_t k = 0; k < kRays; ++k) {
+      const auto want = accel->Intersect(origin, directions[k]);
+      // Edges are met by another arithmetic.
+      if (want.has_value() != (got[k].triangle != kNoTriangle) ||
+          (want && want->triangle != got[k].triangle)) {
+        ++different;
+        continue;
+      }
+      if (!want) continue;
+      ++hits;
+      on_masks += accel->scene().MaterialOf(want->triangle).alpha_cutoff >= 0;
+      EXPECT_NEAR(got[k].t, want->t, 1e-4f * want->t);
+      EXPECT_NEAR(got[k].b1, want->b1, 2e-3f);
+      EXPECT_NEAR(got[k].b2, want->b2, 2e-3f);
+      EXPECT_EQ(got[k].front, want->front);
+      const Vec3f n = accel->scene().GeometricNormal(want->triangle);
+      if (std::fabs(Dot(n, directions[k])) > 1e-3f) {
+        EXPECT_EQ(want->front, Dot(n, directions[k]) < 0);
+      }
+    }
+  }
+  EXPECT_GT(hits, kBundles * kRays / 2);
+  EXPECT_GT(on_masks, hits / 10);
+  EXPECT_LT(different, kBundles * kRays / 5000);
 }
 
 TEST(RayAccel, BarycentricsAreThoseOfThePreparedTriangle) {

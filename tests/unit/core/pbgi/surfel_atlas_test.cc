@@ -109,7 +109,7 @@ TEST(SurfelGrid, AnEmptyTreeHasNothing) {
   const SurfelGrid grid(*tree);
   EXPECT_FALSE(grid.Find({0, 0, 0}, {0, 0, 1}, true).has_value());
   const auto accel = Accel(Plane());
-  EXPECT_FALSE(SurfelAtlas(*accel, *tree).Radiance(0, 0.3f, 0.3f, true).has_value());
+  EXPECT_FALSE(SurfelAtlas(*accel, *tree).Radiance({0, 0.3f, 0.3f, true}).has_value());
 }
 
 // What stands on a surface hides the surfels under it, and they are dark: beside it they must not
@@ -135,6 +135,28 @@ TEST(SurfelGrid, ReadsNeitherWhatIsBuriedNorTheOtherSideOfABoard) {
   }
 }
 
+TEST(SurfelAtlas, PointsThatAreReadTogetherReadWhatEachReads) {
+  const auto scene = Plane();
+  const auto tree = Cloud(Vec3f(scene->origin())).Build();
+  const auto accel = Accel(scene);
+  const SurfelAtlas alone(*accel, *tree), together(*accel, *tree);
+  std::vector<SurfelAtlas::Point> points;
+  for (size_t i = 0; i < SurfelAtlas::kTogether; ++i) {
+    const float b1 = 0.015f * static_cast<float>(i);
+    points.push_back({static_cast<uint32_t>(i % 2), b1, 0.9f * (1 - b1), i % 3 != 0});
+  }
+  for (const size_t count : {points.size(), size_t{1}, size_t{13}}) {
+    std::vector<Rgb> got(count);
+    const uint64_t found = together.Radiances(std::span(points).first(count), got);
+    for (size_t i = 0; i < count; ++i) {
+      const auto want = alone.Radiance(points[i]);
+      ASSERT_EQ((found >> i & 1) != 0, want.has_value()) << i;
+      if (want) EXPECT_EQ(got[i], *want) << i;
+    }
+    EXPECT_NE(found, 0u);
+  }
+}
+
 TEST(SurfelAtlas, EveryPointReadsASurfelNearItOnItsSide) {
   const auto scene = Plane();
   const Vec3f origin(scene->origin());
@@ -148,8 +170,8 @@ TEST(SurfelAtlas, EveryPointReadsASurfelNearItOnItsSide) {
         const float b1 = static_cast<float>(i) / 60, b2 = static_cast<float>(j) / 60;
         for (const uint32_t t : {0u, 1u}) {
           const Vec3f p = scene->PointOn(t, b1, b2) + origin;
-          const auto front = atlas.Radiance(t, b1, b2, true);
-          const auto back = atlas.Radiance(t, b1, b2, false);
+          const auto front = atlas.Radiance({t, b1, b2, true});
+          const auto back = atlas.Radiance({t, b1, b2, false});
           ASSERT_TRUE(front && back) << b1 << " " << b2;
           // The texel's centre is within a spacing, and so is its surfel.
           EXPECT_NEAR(front->x, Pattern(p).x, 0.2f * 0.25f) << b1 << " " << b2;
@@ -174,7 +196,7 @@ TEST(SurfelAtlas, TexelsTileTheTriangle) {
   const int n = 20000;
   for (uint32_t i = 0; i < n; ++i) {
     const Vec2f b = UniformTriangle(OwenSobol(i, 0, 1), OwenSobol(i, 1, 1));
-    sum += Vec3d(*atlas.Radiance(0, b.x, b.y, true));
+    sum += Vec3d(*atlas.Radiance({0, b.x, b.y, true}));
     expected += Vec3d(Pattern(scene->PointOn(0, b.x, b.y) + origin));
   }
   EXPECT_NEAR(sum.x / expected.x, 1, 5e-3);
@@ -215,7 +237,7 @@ TEST(SurfelAtlas, ReadsNothingThroughAWall) {
         for (const uint32_t triangle : {0u, 1u}) {
           const Vec3f p = prepared->PointOn(triangle, b1, b2) + origin;
           for (const bool front : {true, false}) {
-            const bool read = atlas.Radiance(triangle, b1, b2, front).has_value();
+            const bool read = atlas.Radiance({triangle, b1, b2, front}).has_value();
             lit += read && p.x < -0.2f;
             through += read && p.x > 0.035f;
           }
@@ -244,12 +266,12 @@ TEST(SurfelAtlas, KeepsRadianceOfAnyBrightness) {
             {0, 0, 1}, 0.01f, Rgb(1, 0.5f, 0) * scale);
     }
     const auto tree = t.Build();
-    const auto got = SurfelAtlas(*accel, *tree).Radiance(0, 0.2f, 0.3f, true);
+    const auto got = SurfelAtlas(*accel, *tree).Radiance({0, 0.2f, 0.3f, true});
     ASSERT_TRUE(got.has_value());
     EXPECT_NEAR(got->x / scale, 1, 0x1p-9);
     EXPECT_NEAR(got->y / scale, 0.5, 0x1p-9);
     EXPECT_EQ(got->z, 0);
-    EXPECT_EQ(SurfelAtlas(*accel, *tree).Radiance(0, 0.2f, 0.3f, false), Rgb());
+    EXPECT_EQ(SurfelAtlas(*accel, *tree).Radiance({0, 0.2f, 0.3f, false}), Rgb());
   }
 }
 

@@ -27,6 +27,7 @@ class RecordGathererTest : public testing::Test {
     const auto loaded = LoadedScene::Load(*baked, executor_);
     ASSERT_TRUE(loaded.ok()) << loaded.status();
     loaded_ = *loaded;
+    ASSERT_TRUE(data().accel->PrepareBundles().ok());
     rays_.emplace(scene_.cameras[0], kFilm, data().scene->origin());
     map_.emplace(settings_.buffer_map, settings_.microbuffer_px());
   }
