@@ -206,6 +206,7 @@ std::optional<RayHit> RayAccel::Intersect(const Vec3f& origin, const Vec3f& dire
 
 void RayAccel::IntersectBundle(const Vec3f& origin, std::span<const Vec3f> directions,
                                std::span<RayHit> hits) const {
+  const FpTrapPause pause;
   constexpr float kFar = std::numeric_limits<float>::infinity();
   for (size_t i = 0; i < directions.size(); ++i) {
     if (record_ != nullptr) [[unlikely]]

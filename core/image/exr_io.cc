@@ -254,8 +254,8 @@ absl::StatusOr<ExrImage> Read(const std::string& path, std::span<const std::byte
 }
 
 // Columns of the matrix from the file's RGB to Rec. 709, white to white; the identity if the file
-// does not say what its primaries are.
-std::array<Vec3f, 3> Rec709FromFile(const Imf::Header& header) {
+// does not say what its primaries are. Nothing if they span no colours.
+std::optional<std::array<Vec3f, 3>> Rec709FromFile(const Imf::Header& header) {
   std::array<Vec3f, 3> columns{Vec3f(1, 0, 0), Vec3f(0, 1, 0), Vec3f(0, 0, 1)};
   if (!Imf::hasChromaticities(header)) return columns;
   const Imf::Chromaticities& file = Imf::chromaticities(header);
@@ -266,8 +266,10 @@ std::array<Vec3f, 3> Rec709FromFile(const Imf::Header& header) {
   const Imath::V3f white = Imath::V3f(1.0f, 1.0f, 1.0f) * m;
   for (int from = 0; from < 3; ++from) {
     for (int to = 0; to < 3; ++to) {
+      if (!(std::fabs(white[to]) > 0.0f)) return std::nullopt;
       columns[static_cast<size_t>(from)][to] = m[from][to] / white[to];
     }
+    if (!IsFinite(columns[static_cast<size_t>(from)])) return std::nullopt;
   }
   return columns;
 }
@@ -339,7 +341,13 @@ absl::StatusOr<ExrRgbImage> ReadRgb(std::span<const std::byte> bytes, const std:
     for (Rgb& pixel : image.pixels) pixel = Rgb(pixel.x);
     return image;
   }
-  const std::array<Vec3f, 3> m = Rec709FromFile(header);
+  const std::optional<std::array<Vec3f, 3>> columns = Rec709FromFile(header);
+  if (!columns) {
+    return absl::InvalidArgumentError("'" + name +
+                                      "': its chromaticities span no colours; correct or remove "
+                                      "that attribute");
+  }
+  const std::array<Vec3f, 3>& m = *columns;
   if (m[0] != Vec3f(1, 0, 0) || m[1] != Vec3f(0, 1, 0) || m[2] != Vec3f(0, 0, 1)) {
     for (Rgb& p : image.pixels) p = m[0] * p.x + m[1] * p.y + m[2] * p.z;
   }

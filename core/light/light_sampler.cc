@@ -464,6 +464,7 @@ Rgb LightSampler::FromAllPunctual(const Query& q, LightCounters& counters) const
 
 Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
                                LightCounters& counters) const {
+  const FpTrapPause pause;  // a light may be too near for a float: see below
   Vec3f to_light;
   float d_m = std::numeric_limits<float>::infinity();
   Rgb arriving;  // irradiance on a facing surface

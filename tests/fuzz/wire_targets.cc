@@ -119,9 +119,9 @@ std::vector<FuzzBytes> MessageSeeds() {
   stats.counts["surfels"] = 7;
   const SceneBlobs blobs{hello.fingerprint, hello.fingerprint, {}};
   JobStatus status;
-  status.id = JobId("0123456789abcdef0123456789abcdef");
+  status.id = JobId{"0123456789abcdef0123456789abcdef"};
   TileWork work;
-  work.lease = LeaseId("0123456789abcdef0123456789abcdef");
+  work.lease = LeaseId{"0123456789abcdef0123456789abcdef"};
   work.job = status.id;
   work.attempt = 1;
   work.rect = {0, 0, 32, 32};
@@ -129,7 +129,7 @@ std::vector<FuzzBytes> MessageSeeds() {
   work.blobs = blobs;
   work.lease_time = std::chrono::milliseconds(1000);
   WorkerWelcome welcome;
-  welcome.id = WorkerId("0123456789abcdef0123456789abcdef");
+  welcome.id = WorkerId{"0123456789abcdef0123456789abcdef"};
   return {Message(0, ToWire(SmallJob())),  Message(1, ToWire(status)),
           Message(5, ToWire(explanation)), Message(7, ToWire(hello)),
           Message(8, ToWire(welcome)),     Message(9, ToWire(work)),

@@ -146,6 +146,25 @@ TEST(EnvironmentMap, OtherPrimariesAreConvertedAndWhiteStaysWhite) {
   EXPECT_EQ(environment.map[1].x, 0);
 }
 
+TEST(EnvironmentMap, PrimariesWithoutColoursAreRefused) {
+  for (const std::array<float, 8>& primaries :
+       {std::array<float, 8>{},
+        std::array<float, 8>{0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f},
+        std::array<float, 8>{0.6f, 0.3f, 0.3f, 0.6f, 0.1f, 0.1f, 0.0f, 0.0f}}) {
+    ExrFile file = Rgb2x1(false, {5, 5, 5, 0, 1, 0});
+    file.Attribute("chromaticities", "chromaticities", ExrFile::Bytes(primaries));
+    Environment environment;
+    const absl::Status status = LoadEnvironmentMap(file.Encode(), "sky.exr", environment);
+    if (!status.ok()) continue;
+    // OpenEXR makes something of some: then it is light.
+    for (const Rgb& texel : environment.map) EXPECT_TRUE(IsFinite(texel));
+  }
+  const std::array<float, 8> point{0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f, 0.3f};
+  ExrFile file = Rgb2x1(false, {5, 5, 5, 0, 1, 0});
+  file.Attribute("chromaticities", "chromaticities", ExrFile::Bytes(point));
+  ExpectRefused(file.Encode(), "sky.exr");
+}
+
 TEST(EnvironmentMap, NegativeIsBlackAndWhatIsNotFiniteIsRefused) {
   Environment environment;
   ASSERT_TRUE(LoadEnvironmentMap(Rgb2x1(false, {-1, -0.0f, 2, 3, -1e9f, 4}).Encode(), "sky.exr",
