@@ -457,9 +457,9 @@ float SurfelSpacingM(double area_m2, uint64_t count) {
       RoundMantissa(kSpacingFactor * std::sqrt(area_m2 / static_cast<double>(count)), 7));
 }
 
-float DefaultSurfelSpacingM(double area_m2, float diagonal_m, bool sharp_shadows) {
-  const double edge = static_cast<double>(diagonal_m) / (sharp_shadows ? 500.0 : 250.0);
-  const double n = edge > 0 ? area_m2 / (edge * edge) : 0;
+float DefaultSurfelSpacingM(double area_m2, float diagonal_m, uint64_t most) {
+  const double edge = static_cast<double>(diagonal_m) / 500.0;
+  const double n = std::min(edge > 0 ? area_m2 / (edge * edge) : 0, static_cast<double>(most));
   if (!(area_m2 > 0)) return 0;
   return static_cast<float>(
       RoundMantissa(kSpacingFactor * std::sqrt(area_m2 / std::clamp(n, 1e5, 4e6)), 3));

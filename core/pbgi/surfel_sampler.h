@@ -24,10 +24,10 @@ namespace farpoint {
 // little keeps its surfels. 0 if there is no area or no count.
 float SurfelSpacingM(double area_m2, uint64_t count);
 
-// The spacing when the user names no count: one surfel for each square of edge diagonal/500, or
-// diagonal/250 where no light is small enough to cast sharp shadows, between 100,000 and 4,000,000,
-// rounded to 3 bits. Depends on the scene only, never on the camera.
-float DefaultSurfelSpacingM(double area_m2, float diagonal_m, bool sharp_shadows);
+// The spacing when the user names no count: one surfel for each square of edge diagonal/500, but no
+// more than `most`, between 100,000 and 4,000,000, rounded to 3 bits. Depends on the scene only,
+// never on the camera.
+float DefaultSurfelSpacingM(double area_m2, float diagonal_m, uint64_t most);
 
 // Where the surfels of one object lie on it. All of one length. Neighbours in the order are
 // neighbours in space: cubes of 16 spacings along a Morton curve.

@@ -98,9 +98,12 @@ Digest GeometryKey(const Scene& scene, const PreparedScene& prepared) {
 
 float SpacingFor(const RenderSettings& settings, double area_m2, const PreparedScene& prepared) {
   if (settings.points != 0) return SurfelSpacingM(area_m2, settings.points);
-  // A map may hold a sun.
+  // Where light is soft and faces are large, light is smooth. A map may hold a sun.
+  constexpr uint64_t kMostPerTriangle = 64;
   const bool sharp = !prepared.lights().empty() || prepared.has_environment_map();
-  return DefaultSurfelSpacingM(area_m2, prepared.diagonal_m(), sharp);
+  return DefaultSurfelSpacingM(
+      area_m2, prepared.diagonal_m(),
+      sharp ? ~uint64_t{0} : kMostPerTriangle * prepared.triangles().size());
 }
 
 // The stages after the prepared scene.

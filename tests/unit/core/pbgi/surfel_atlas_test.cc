@@ -151,7 +151,9 @@ TEST(SurfelAtlas, PointsThatAreReadTogetherReadWhatEachReads) {
     for (size_t i = 0; i < count; ++i) {
       const auto want = alone.Radiance(points[i]);
       ASSERT_EQ((found >> i & 1) != 0, want.has_value()) << i;
-      if (want) EXPECT_EQ(got[i], *want) << i;
+      if (want) {
+        EXPECT_EQ(got[i], *want) << i;
+      }
     }
     EXPECT_NE(found, 0u);
   }

@@ -319,10 +319,12 @@ TEST(SurfelSpacing, ChangesInSteps) {
   EXPECT_EQ(SurfelSpacingM(4, 10000), SurfelSpacingM(std::nextafter(4.0, 5.0), 10000));
   EXPECT_EQ(SurfelSpacingM(16, 10000), 2 * SurfelSpacingM(4, 10000));
   // 500 squares along the diagonal, within the limits.
-  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, true), 0.759 / 500, 0.07 * 0.759 / 500);
-  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, false), 0.759 / 250, 0.07 * 0.759 / 250);
-  EXPECT_NEAR(DefaultSurfelSpacingM(0.001, 1, true), 0.759 * std::sqrt(0.001 / 1e5), 2e-5 * 0.8);
-  EXPECT_EQ(DefaultSurfelSpacingM(0, 0, true), 0);
+  constexpr uint64_t kAny = ~uint64_t{0};
+  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, kAny), 0.759 / 500, 0.07 * 0.759 / 500);
+  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, 125'000), 0.759 / 250, 0.07 * 0.759 / 250);
+  EXPECT_NEAR(DefaultSurfelSpacingM(0.001, 1, kAny), 0.759 * std::sqrt(0.001 / 1e5), 2e-5 * 0.8);
+  EXPECT_NEAR(DefaultSurfelSpacingM(1, 1, 7), 0.759 * std::sqrt(1 / 1e5), 0.07 * 0.0024);
+  EXPECT_EQ(DefaultSurfelSpacingM(0, 0, kAny), 0);
 }
 
 }  // namespace
