@@ -12,7 +12,9 @@ namespace {
 // times its size, whatever the image's header says.
 thread_local size_t block_limit = 0;
 
-void* LimitedAlloc(size_t size) { return size > block_limit ? nullptr : std::malloc(size); }
+// Zeros: stb_image 2.27 decodes by Huffman tables that a file does not define. Of what the memory
+// held before, that reads anywhere and paints it; of zeros it reads symbol 0.
+void* LimitedAlloc(size_t size) { return size > block_limit ? nullptr : std::calloc(1, size); }
 void* LimitedRealloc(void* block, size_t size) {
   return size > block_limit ? nullptr : std::realloc(block, size);
 }
@@ -48,6 +50,47 @@ absl::Status Fail(const std::string& name, const std::string& text) {
 
 const stbi_uc* DataOf(std::span<const std::byte> bytes) {
   return reinterpret_cast<const stbi_uc*>(bytes.data());
+}
+
+// False for a JPEG with a Huffman table of more than 256 codes, which stb_image 2.27 writes beyond
+// its arrays. Reads the markers as stb_image does, so that it sees every table that that will see.
+bool HuffmanTablesFit(std::span<const std::byte> bytes) {
+  const auto at = [&](size_t i) {
+    return i < bytes.size() ? std::to_integer<unsigned>(bytes[i]) : 0u;
+  };
+  constexpr unsigned kMark = 0xff, kStart = 0xd8, kEnd = 0xd9, kHuffman = 0xc4;
+  size_t start = 0;
+  while (start < bytes.size() && at(start) == kMark) ++start;
+  if (start == 0 || at(start) != kStart) return true;  // no JPEG
+  constexpr size_t kCounts = 16, kMaxCodes = 256;
+  for (size_t i = start + 1; i < bytes.size();) {
+    if (at(i) != kMark) {  // padding, or the data of a scan
+      ++i;
+      continue;
+    }
+    while (i < bytes.size() && at(i) == kMark) ++i;
+    const unsigned marker = at(i++);
+    if (marker == kEnd) return true;
+    // What stands alone: a stuffed byte, restarts.
+    if (marker == 0 || marker == 1 || (marker >= 0xd0 && marker < kEnd)) continue;
+    const size_t length = at(i) << 8 | at(i + 1);
+    if (length < 2) return true;  // stb_image gives up here
+    if (marker == kHuffman) {
+      size_t table = i + 2;
+      for (auto left = static_cast<int64_t>(length) - 2; left > 0 && table < bytes.size();) {
+        size_t codes = 0;
+        for (size_t k = 1; k <= kCounts; ++k) codes += at(table + k);
+        if (codes > kMaxCodes) return false;
+        table += 1 + kCounts + codes;
+        left -= static_cast<int64_t>(1 + kCounts + codes);
+      }
+      // The last table may reach beyond its segment: reading goes on behind it.
+      i = std::max(i + length, table);
+      continue;
+    }
+    i += length;
+  }
+  return true;
 }
 
 constexpr size_t kMaxStoredBlock = 65535;
@@ -114,6 +157,9 @@ class Adler32 {
 absl::StatusOr<ImageSize> ReadImageSize(const std::string& name, std::span<const std::byte> bytes) {
   if (bytes.empty()) return Fail(name, "is empty; export it again");
   if (bytes.size() > (size_t{1} << 30)) return Fail(name, "has more than 1 GiB; make it smaller");
+  if (!HuffmanTablesFit(bytes)) {
+    return Fail(name, "has a Huffman table of more than 256 codes; export it again");
+  }
   int width = 0, height = 0, channels = 0;
   block_limit = kHeaderBlockLimit;
   if (stbi_info_from_memory(DataOf(bytes), static_cast<int>(bytes.size()), &width, &height,

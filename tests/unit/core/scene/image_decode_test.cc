@@ -9,6 +9,7 @@ namespace farpoint {
 namespace {
 
 using ::testing::HasSubstr;
+using ::testing::Not;
 
 absl::StatusOr<DecodedImage> Decode(const std::string& bytes) {
   return DecodeImage("test.png", std::as_bytes(std::span(bytes)));
@@ -89,6 +90,35 @@ TEST(DecodeImage, ReadsEveryKindOfPng) {
     const auto image = Decode(FromBase64(c.base64));
     ASSERT_TRUE(image.ok()) << c.name << ": " << image.status();
     EXPECT_EQ(image->texels, c.texels) << c.name;
+  }
+}
+
+// stb_image would write them beyond its arrays.
+TEST(DecodeImage, RefusesHuffmanTablesOfMoreThan256Codes) {
+  const auto jpeg = [](const std::vector<int>& counts, size_t before) {
+    std::string text("\xff\xff\xd8", before > 0 ? 3 : 0);
+    if (before == 0) text = std::string("\xff\xd8", 2);
+    text += std::string("\xff\xe0\x00\x04\x01\x02", 6);  // a segment to be passed over
+    text += std::string(before, '\0');
+    const size_t length = 2 + 17 * counts.size();
+    text += std::string("\xff\xff\xc4", 3);  // markers may be padded
+    text += static_cast<char>(length >> 8);
+    text += static_cast<char>(length & 255);
+    for (const int count : counts) {
+      text += '\0';
+      text += std::string(16, static_cast<char>(count));
+    }
+    return text + std::string(100, '\x01');
+  };
+  const auto message = [](const std::string& text) {
+    const auto bytes = std::as_bytes(std::span(text));
+    return std::string(DecodeImage("bad.jpg", bytes).status().message());
+  };
+  for (const size_t before : {0u, 3u}) {
+    EXPECT_THAT(message(jpeg({255}, before)), HasSubstr("Huffman table"));
+    EXPECT_THAT(message(jpeg({17}, before)), HasSubstr("Huffman table"));
+    EXPECT_THAT(message(jpeg({0, 17}, before)), HasSubstr("Huffman table"));
+    EXPECT_THAT(message(jpeg({16}, before)), Not(HasSubstr("Huffman table")));
   }
 }
 
