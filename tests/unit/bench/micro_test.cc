@@ -86,10 +86,10 @@ TEST(Micro, EveryKernelRunsAndCounts) {
   // Both ask about the same rays.
   EXPECT_EQ(found["ray_accel/intersect/incoherent"]["hit_fraction"],
             found["ray_accel/occluded/incoherent"]["hit_fraction"]);
-  // Two groups (geometry and radiance) of eight nodes hold a surfel and its share of what is above.
+  // A group of eight surfels and one of their radiances, and a share of what is above.
   const double bytes = found["point_tree/build"]["bytes_per_surfel"];
-  EXPECT_GT(bytes, (384 + 192) / 8.0);
-  EXPECT_LT(bytes, (384 + 192) / 7.0 + 4.0);
+  EXPECT_GT(bytes, (112 + 64) / 8.0);
+  EXPECT_LT(bytes, 28);
 }
 
 TEST(Micro, FilterChooses) {
