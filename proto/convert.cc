@@ -1113,6 +1113,7 @@ absl::StatusOr<TileWork> TileWorkFromWire(const v1::TileWork& wire) {
   FP_RETURN_IF_ERROR(CheckRange(wire.lease_ms(), 1, 1e9, "lease_ms"));
   work.lease_time = std::chrono::milliseconds(wire.lease_ms());
   work.frame_index = wire.frame_index();
+  work.careful = wire.careful();
   return work;
 }
 v1::TileWork ToWire(const TileWork& work) {
@@ -1128,6 +1129,7 @@ v1::TileWork ToWire(const TileWork& work) {
   *wire.mutable_blobs() = ToWire(work.blobs);
   wire.set_lease_ms(static_cast<uint32_t>(work.lease_time.count()));
   wire.set_frame_index(work.frame_index);
+  wire.set_careful(work.careful);
   return wire;
 }
 

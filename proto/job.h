@@ -303,12 +303,19 @@ struct TileWork {
   FrameSpec frame;
   SceneBlobs blobs;
   std::chrono::milliseconds lease_time{0};  // lost if progress stops for so long
+  // It failed before: one block after the other, each told of before it is begun.
+  bool careful = false;
 };
 
 struct LeaseProgress {
-  uint64_t counter = 0;  // grows while work is done
-  float fraction = 0;    // [0, 1] of the tile, for people
+  uint64_t counter = 0;    // grows while work is done
+  float fraction = 0;      // [0, 1] of the tile, for people
+  std::string at{};        // where the work is, for people; empty: not told
+  bool rendering = false;  // blobs and scene are there
+  // Processor time of the worker's whole process; 0: not known.
+  std::chrono::milliseconds cpu{0};
 };
+inline constexpr size_t kMaxPlaceBytes = 200;  // of LeaseProgress::at
 // Whether to go on after a heartbeat, and whether a result was taken.
 struct RenewAnswer {
   bool drop = false;
