@@ -22,6 +22,24 @@ constexpr size_t kMaxStatNameBytes = 64;
 constexpr size_t kMaxTiles = size_t{1} << 22;  // 65536² pixels in tiles of 32
 constexpr size_t kMaxNotes = 10000;
 
+void LimitsToWire(const JobLimits& limits, v1::JobLimits* wire) {
+  wire->set_max_pixels(limits.max_pixels);
+  wire->set_max_asset_bytes(limits.max_asset_bytes);
+  wire->set_max_triangles(limits.max_triangles);
+  wire->set_max_surfels(limits.max_surfels);
+  wire->set_max_seconds(limits.max_seconds);
+}
+// What is absent stays at its default.
+JobLimits LimitsFromWire(const v1::JobLimits& wire) {
+  JobLimits limits;
+  if (wire.has_max_pixels()) limits.max_pixels = wire.max_pixels();
+  if (wire.has_max_asset_bytes()) limits.max_asset_bytes = wire.max_asset_bytes();
+  if (wire.has_max_triangles()) limits.max_triangles = wire.max_triangles();
+  if (wire.has_max_surfels()) limits.max_surfels = wire.max_surfels();
+  if (wire.has_max_seconds()) limits.max_seconds = wire.max_seconds();
+  return limits;
+}
+
 std::string Path(std::string_view field, std::string_view member) {
   return field.empty() ? std::string(member) : std::string(field) + "." + std::string(member);
 }
@@ -426,11 +444,7 @@ v1::RenderJob ToWire(const JobSpec& job) {
   *wire.mutable_overrides() = OverridesToWire(job.overrides);
   wire.set_light_units(job.light_units == LightUnits::kRaw ? v1::LIGHT_UNITS_RAW
                                                            : v1::LIGHT_UNITS_PHOTOMETRIC);
-  wire.mutable_limits()->set_max_pixels(job.limits.max_pixels);
-  wire.mutable_limits()->set_max_asset_bytes(job.limits.max_asset_bytes);
-  wire.mutable_limits()->set_max_triangles(job.limits.max_triangles);
-  wire.mutable_limits()->set_max_surfels(job.limits.max_surfels);
-  wire.mutable_limits()->set_max_seconds(job.limits.max_seconds);
+  LimitsToWire(job.limits, wire.mutable_limits());
   wire.set_title(job.title);
   wire.set_priority(job.priority);
   for (const int32_t frame : job.frames) wire.add_frames(frame);
@@ -820,6 +834,7 @@ absl::StatusOr<JobStatus> JobStatusFromWire(const v1::JobStatus& wire) {
   const v1::FrameCounts& frames = wire.frames();
   status.frames = {frames.total(), frames.baked(), frames.done()};
   FP_ASSIGN_OR_RETURN(status.after, JobIdsFromWire(wire.after(), "status.after"));
+  status.owner = wire.owner();
   return status;
 }
 v1::JobStatus ToWire(const JobStatus& status) {
@@ -845,6 +860,7 @@ v1::JobStatus ToWire(const JobStatus& status) {
   wire.mutable_frames()->set_baked(status.frames.baked);
   wire.mutable_frames()->set_done(status.frames.done);
   for (const JobId& id : status.after) wire.add_after(id.value);
+  wire.set_owner(status.owner);
   return wire;
 }
 
@@ -1067,6 +1083,7 @@ absl::StatusOr<WorkerHello> HelloFromWire(const v1::RegisterRequest& wire) {
 v1::RegisterRequest ToWire(const WorkerHello& hello) {
   v1::RegisterRequest wire;
   wire.set_protocol_version(kProtocolVersion);
+  wire.set_oldest_protocol_version(kOldestProtocolVersion);
   wire.set_version(hello.version);
   wire.set_fingerprint(ToWire(hello.fingerprint));
   wire.set_threads(hello.threads);
@@ -1160,12 +1177,110 @@ v1::ReturnHeader ToWire(const WorkerId& worker, const TileResult& result) {
   return wire;
 }
 
-absl::Status CheckProtocolVersion(uint32_t version, std::string_view peer) {
-  if (version == kProtocolVersion) return absl::OkStatus();
+absl::StatusOr<CoordinatorHealth> HealthFromWire(const v1::DiagnoseResponse& wire) {
+  CoordinatorHealth health;
+  health.version = wire.version();
+  health.protocol_version = wire.protocol_version();
+  health.oldest_protocol_version = wire.oldest_protocol_version();
+  health.unix_ms = wire.unix_ms();
+  health.draining = wire.draining();
+  health.caller_name = wire.caller_name();
+  health.caller_role = wire.caller_role();
+  health.store_error = wire.store_error();
+  health.store_free_bytes = wire.store_free_bytes();
+  health.store_total_bytes = wire.store_total_bytes();
+  health.memory_available_bytes = wire.memory_available_bytes();
+  health.memory_total_bytes = wire.memory_total_bytes();
+  health.open_files = wire.open_files();
+  health.open_files_limit = wire.open_files_limit();
+  health.connections = wire.connections();
+  health.max_connections = wire.max_connections();
+  health.max_request_bytes = wire.max_request_bytes();
+  health.max_blob_bytes = wire.max_blob_bytes();
+  health.limits = LimitsFromWire(wire.limits());
+  health.max_jobs = wire.max_jobs();
+  health.max_bytes = wire.max_bytes();
+  health.jobs = wire.jobs();
+  health.bytes = wire.bytes();
+  for (const v1::WorkerStatus& one : wire.workers()) {
+    FP_ASSIGN_OR_RETURN(WorkerStatus worker, WorkerStatusFromWire(one));
+    health.workers.push_back(std::move(worker));
+  }
+  health.blob_directory = wire.blob_dir();
+  health.blob_mark = wire.blob_dir_mark();
+  health.certificate_not_after_s = wire.certificate_not_after_unix_s();
+  return health;
+}
+v1::DiagnoseResponse ToWire(const CoordinatorHealth& health) {
+  v1::DiagnoseResponse wire;
+  wire.set_version(health.version);
+  wire.set_protocol_version(health.protocol_version);
+  wire.set_oldest_protocol_version(health.oldest_protocol_version);
+  wire.set_unix_ms(health.unix_ms);
+  wire.set_draining(health.draining);
+  wire.set_caller_name(health.caller_name);
+  wire.set_caller_role(health.caller_role);
+  wire.set_store_error(health.store_error);
+  wire.set_store_free_bytes(health.store_free_bytes);
+  wire.set_store_total_bytes(health.store_total_bytes);
+  wire.set_memory_available_bytes(health.memory_available_bytes);
+  wire.set_memory_total_bytes(health.memory_total_bytes);
+  wire.set_open_files(health.open_files);
+  wire.set_open_files_limit(health.open_files_limit);
+  wire.set_connections(health.connections);
+  wire.set_max_connections(health.max_connections);
+  wire.set_max_request_bytes(health.max_request_bytes);
+  wire.set_max_blob_bytes(health.max_blob_bytes);
+  LimitsToWire(health.limits, wire.mutable_limits());
+  wire.set_max_jobs(health.max_jobs);
+  wire.set_max_bytes(health.max_bytes);
+  wire.set_jobs(health.jobs);
+  wire.set_bytes(health.bytes);
+  for (const WorkerStatus& worker : health.workers) *wire.add_workers() = ToWire(worker);
+  wire.set_blob_dir(health.blob_directory);
+  wire.set_blob_dir_mark(health.blob_mark);
+  wire.set_certificate_not_after_unix_s(health.certificate_not_after_s);
+  return wire;
+}
+
+absl::StatusOr<uint32_t> AgreeOnProtocol(uint32_t oldest, uint32_t newest, std::string_view peer) {
+  if (oldest == 0 || oldest > newest) oldest = newest;
+  if (newest >= kOldestProtocolVersion && oldest <= kProtocolVersion) {
+    return std::min(newest, kProtocolVersion);
+  }
+  const auto range = [](uint32_t from, uint32_t to) {
+    return from == to ? std::to_string(to) : std::to_string(from) + " to " + std::to_string(to);
+  };
   return absl::FailedPreconditionError(
-      "the " + std::string(peer) + " speaks protocol " + std::to_string(version) +
-      ", this coordinator protocol " + std::to_string(kProtocolVersion) + "; update the " +
-      (version < kProtocolVersion ? std::string(peer) : std::string("coordinator")));
+      "the " + std::string(peer) + " speaks protocol " + range(oldest, newest) +
+      ", this coordinator protocol " + range(kOldestProtocolVersion, kProtocolVersion) +
+      "; update the " +
+      (newest < kOldestProtocolVersion ? std::string(peer) : std::string("coordinator")));
+}
+
+absl::Status CheckFieldsKnown(const google::protobuf::Message& message, std::string_view where) {
+  const google::protobuf::Reflection& reflection = *message.GetReflection();
+  if (const auto& unknown = reflection.GetUnknownFields(message); !unknown.empty()) {
+    return absl::FailedPreconditionError(std::string(where) + " has a field (number " +
+                                         std::to_string(unknown.field(0).number()) +
+                                         ") that this coordinator does not know; update the "
+                                         "coordinator, or leave out what is new");
+  }
+  std::vector<const google::protobuf::FieldDescriptor*> fields;
+  reflection.ListFields(message, &fields);
+  for (const google::protobuf::FieldDescriptor* field : fields) {
+    if (field->cpp_type() != google::protobuf::FieldDescriptor::CPPTYPE_MESSAGE) continue;
+    const std::string path = std::string(where) + "." + field->name();
+    if (!field->is_repeated()) {
+      FP_RETURN_IF_ERROR(CheckFieldsKnown(reflection.GetMessage(message, field), path));
+      continue;
+    }
+    for (int i = 0; i < reflection.FieldSize(message, field); ++i) {
+      FP_RETURN_IF_ERROR(CheckFieldsKnown(reflection.GetRepeatedMessage(message, field, i),
+                                          path + "[" + std::to_string(i) + "]"));
+    }
+  }
+  return absl::OkStatus();
 }
 
 }  // namespace farpoint

@@ -99,7 +99,17 @@ struct ReturnHead {
 absl::StatusOr<ReturnHead> ReturnHeadFromWire(const v1::ReturnHeader& wire, uint64_t max_bytes);
 v1::ReturnHeader ToWire(const WorkerId& worker, const TileResult& result);
 
-// kFailedPrecondition, saying which side to update, unless `version` is ours.
-absl::Status CheckProtocolVersion(uint32_t version, std::string_view peer);
+absl::StatusOr<CoordinatorHealth> HealthFromWire(const v1::DiagnoseResponse& wire);
+v1::DiagnoseResponse ToWire(const CoordinatorHealth& health);
+
+// The newest version that both sides speak: the peer those from `oldest` (0: `newest`) to `newest`,
+// we those from kOldestProtocolVersion to kProtocolVersion. kFailedPrecondition, saying which side
+// to update, if there is none. `peer` is "client" or "worker".
+absl::StatusOr<uint32_t> AgreeOnProtocol(uint32_t oldest, uint32_t newest, std::string_view peer);
+
+// kFailedPrecondition names a field of `message`, or of what it holds, that this version does not
+// know: who leaves it out would do something else than was asked for. `where` is the message's
+// path.
+absl::Status CheckFieldsKnown(const google::protobuf::Message& message, std::string_view where);
 
 }  // namespace farpoint

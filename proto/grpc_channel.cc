@@ -4,19 +4,53 @@
 #include <grpcpp/security/credentials.h>
 #include <grpcpp/support/channel_arguments.h>
 
+#include <map>
+
 namespace farpoint {
 
 namespace {
 
 constexpr int kKeepaliveMs = 2000;
 constexpr int kKeepaliveTimeoutMs = 1000;
-// Job descriptions with their lists of files and tiles are the largest messages; bulk data travel
-// in chunks of 1 MiB.
-constexpr int kMaxMessageBytes = 64 << 20;
+constexpr int kHandshakeMs = 10000;
+// Of one connection. A simulated farm may hold some hundred waiting calls on one.
+constexpr int kMaxStreams = 1024;
+constexpr int kMaxHeaderBytes = 16 << 10;
+constexpr std::chrono::milliseconds kProbeTime{3000};
+
+// The token of a client, on every call.
+class TokenPlugin final : public grpc::MetadataCredentialsPlugin {
+ public:
+  explicit TokenPlugin(std::string token) : header_("Bearer " + std::move(token)) {}
+  bool IsBlocking() const override { return false; }
+  const char* GetType() const override { return "farpoint-token"; }
+  grpc::Status GetMetadata(grpc::string_ref, grpc::string_ref, const grpc::AuthContext&,
+                           std::multimap<std::string, std::string>* metadata) override {
+    metadata->emplace("authorization", header_);
+    return grpc::Status::OK;
+  }
+
+ private:
+  const std::string header_;
+};
+
+std::shared_ptr<grpc::ChannelCredentials> ClientCredentials(const ChannelSecurity& security) {
+  if (!security.tls) return grpc::InsecureChannelCredentials();
+  grpc::SslCredentialsOptions options;
+  options.pem_root_certs = security.tls->ca;
+  options.pem_private_key = security.tls->key;
+  options.pem_cert_chain = security.tls->certificate;
+  std::shared_ptr<grpc::ChannelCredentials> credentials = grpc::SslCredentials(options);
+  if (security.token.empty()) return credentials;
+  return grpc::CompositeChannelCredentials(
+      credentials,
+      grpc::MetadataCredentialsFromPlugin(std::make_unique<TokenPlugin>(security.token)));
+}
 
 }  // namespace
 
-std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address) {
+std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
+                                           const ChannelSecurity& security) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveMs);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveTimeoutMs);
@@ -25,8 +59,18 @@ std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address) {
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
   arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 1000);
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
-  arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
-  return grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments);
+  // A farm is not reached through the proxy that a machine's browser wants.
+  arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetMaxReceiveMessageSize(kMaxResponseBytes);
+  return grpc::CreateCustomChannel(address, ClientCredentials(security), arguments);
+}
+
+absl::Status ExplainFailure(const absl::Status& status, const std::string& address,
+                            const ChannelSecurity& security) {
+  if (!absl::IsUnavailable(status)) return status;
+  absl::Status found = ProbeConnection(address, security, kProbeTime);
+  // A server that can be reached by now, or is just being started, is worth another try.
+  return found.ok() ? status : found;
 }
 
 void ConfigureServer(grpc::ServerBuilder& builder) {
@@ -38,7 +82,18 @@ void ConfigureServer(grpc::ServerBuilder& builder) {
                              kKeepaliveMs / 2);
   // Two coordinators must not share a port by accident.
   builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);
-  builder.SetMaxReceiveMessageSize(kMaxMessageBytes);
+  builder.AddChannelArgument(GRPC_ARG_SERVER_HANDSHAKE_TIMEOUT_MS, kHandshakeMs);
+  builder.AddChannelArgument(GRPC_ARG_MAX_CONCURRENT_STREAMS, kMaxStreams);
+  builder.AddChannelArgument(GRPC_ARG_MAX_METADATA_SIZE, kMaxHeaderBytes);
+  builder.SetMaxReceiveMessageSize(kMaxRequestBytes);
+  builder.SetMaxSendMessageSize(kMaxResponseBytes);
+}
+
+std::shared_ptr<grpc::ServerCredentials> ServerTls(const TlsMaterial& material) {
+  grpc::SslServerCredentialsOptions options(GRPC_SSL_REQUEST_CLIENT_CERTIFICATE_BUT_DONT_VERIFY);
+  options.pem_root_certs = material.ca;
+  options.pem_key_cert_pairs.push_back({material.key, material.certificate});
+  return grpc::SslServerCredentials(options);
 }
 
 }  // namespace farpoint

@@ -1,23 +1,39 @@
-// How farpoint's processes connect: keepalive, message sizes, deadlines. One place for both sides,
-// since a server that expects fewer pings than its clients send cuts them off.
+// How farpoint's processes connect: keepalive, message sizes, deadlines, encryption. One place for
+// both sides, since a server that expects fewer pings than its clients send cuts them off.
 #pragma once
 
 #include <grpcpp/channel.h>
 #include <grpcpp/client_context.h>
+#include <grpcpp/security/server_credentials.h>
 #include <grpcpp/server_builder.h>
 
 #include <chrono>
 #include <memory>
 #include <string>
 
+#include "proto/connection_probe.h"
+
 namespace farpoint {
+
+// Job descriptions with their lists of files and tiles are the largest messages; bulk data travel
+// in chunks of 1 MiB. What is larger is refused before it is read.
+inline constexpr int kMaxRequestBytes = 32 << 20;
+inline constexpr int kMaxResponseBytes = 128 << 20;
 
 // Connects in the background. Without keepalive a link that goes down would never be noticed; with
 // it in 3 s.
-std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address);
+std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
+                                           const ChannelSecurity& security = {});
 
-// The same on the server's side.
+// What of a failed call's cause can be found out by looking: with a connection that failed
+// (kUnavailable), ProbeConnection's answer if that is worth more; else `status` as it is.
+absl::Status ExplainFailure(const absl::Status& status, const std::string& address,
+                            const ChannelSecurity& security);
+
+// The same on the server's side: keepalive, limits of messages, streams and time to connect.
 void ConfigureServer(grpc::ServerBuilder& builder);
+// Asks every peer for a certificate and takes whatever comes: who uses this checks each call.
+std::shared_ptr<grpc::ServerCredentials> ServerTls(const TlsMaterial& material);
 
 inline void SetDeadline(grpc::ClientContext& context, std::chrono::milliseconds timeout) {
   context.set_deadline(std::chrono::system_clock::now() + timeout);

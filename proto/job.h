@@ -26,8 +26,11 @@
 
 namespace farpoint {
 
-// Raised whenever an older peer would misunderstand a newer one. Checked at Submit and Register.
-inline constexpr uint32_t kProtocolVersion = 2;
+// Raised whenever an older peer would misunderstand a newer one. Each side says which versions it
+// speaks, and they take the newest one of both. Checked at Submit and Register.
+inline constexpr uint32_t kProtocolVersion = 3;
+// 2 knows no owners, no health and no authentication, and says everything else in the same way.
+inline constexpr uint32_t kOldestProtocolVersion = 2;
 // Bulk data travel in pieces of this size; nobody sends or accepts larger ones.
 inline constexpr size_t kChunkBytes = size_t{1} << 20;
 
@@ -188,6 +191,7 @@ struct JobStatus {
   int64_t submitted_unix_ms = 0;
   FrameCounts frames;
   std::vector<JobId> after;
+  std::string owner;  // who submitted it; empty: not known
 };
 
 struct WorkerStatus {
@@ -233,6 +237,28 @@ struct JobEvent {
 // Why a job is in the state that it is in, for people: one line each.
 struct Explanation {
   std::vector<std::string> lines;
+};
+
+// How a coordinator is: what `farpoint doctor` asks. Numbers are 0 where something is not known.
+struct CoordinatorHealth {
+  std::string version;
+  uint32_t protocol_version = 0, oldest_protocol_version = 0;
+  int64_t unix_ms = 0;  // by its clock
+  bool draining = false;
+  std::string caller_name, caller_role;  // how it knows the caller; empty without TLS
+  std::string store_error;               // why its store cannot be written
+  uint64_t store_free_bytes = 0, store_total_bytes = 0;
+  uint64_t memory_available_bytes = 0, memory_total_bytes = 0;
+  uint64_t open_files = 0, open_files_limit = 0;
+  uint64_t connections = 0, max_connections = 0;
+  uint64_t max_request_bytes = 0, max_blob_bytes = 0;
+  JobLimits limits;
+  uint64_t max_jobs = 0, max_bytes = 0;  // of the caller; 0: no limit
+  uint64_t jobs = 0, bytes = 0;          // of the caller, now
+  std::vector<WorkerStatus> workers;
+  // A shared folder of blobs, and the name of a file that stands there now; empty: none.
+  std::string blob_directory, blob_mark;
+  int64_t certificate_not_after_s = 0;
 };
 
 struct SceneBlobs {

@@ -11,7 +11,8 @@ constexpr int kMaxAsked = 65536;
 
 class BlobServiceImpl final : public v1::BlobService::Service {
  public:
-  explicit BlobServiceImpl(CoordinatorApi& coordinator) : coordinator_(coordinator) {}
+  BlobServiceImpl(CoordinatorApi& coordinator, const ServiceAccess& access)
+      : coordinator_(coordinator), access_(access) {}
 
   grpc::Status FindMissing(grpc::ServerContext*, const v1::FindMissingRequest* request,
                            v1::FindMissingResponse* response) override {
@@ -31,14 +32,19 @@ class BlobServiceImpl final : public v1::BlobService::Service {
     }());
   }
 
-  grpc::Status Put(grpc::ServerContext*, grpc::ServerReader<v1::PutBlobChunk>* stream,
+  grpc::Status Put(grpc::ServerContext* context, grpc::ServerReader<v1::PutBlobChunk>* stream,
                    v1::PutBlobResponse*) override {
     return ToGrpc([&]() -> absl::Status {
+      FP_ASSIGN_OR_RETURN(const Caller caller, CallerOf(*context, access_));
       v1::PutBlobChunk chunk;
       if (!stream->Read(&chunk)) return absl::InvalidArgumentError("Put without a message");
       FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(chunk.sha256(), "sha256"));
+      const uint64_t size = chunk.size_bytes();
+      if (access_.ledger != nullptr) {
+        FP_RETURN_IF_ERROR(access_.ledger->MayStore(caller.name, size));
+      }
       FP_ASSIGN_OR_RETURN(const std::unique_ptr<BlobWriter> writer,
-                          coordinator_.StartPut(digest, chunk.size_bytes()));
+                          coordinator_.StartPut(digest, size));
       do {
         if (chunk.data().size() > kChunkBytes) {
           return absl::InvalidArgumentError("data has " + std::to_string(chunk.data().size()) +
@@ -48,7 +54,9 @@ class BlobServiceImpl final : public v1::BlobService::Service {
         FP_RETURN_IF_ERROR(
             writer->Append(std::as_bytes(std::span(chunk.data().data(), chunk.data().size()))));
       } while (stream->Read(&chunk));
-      return writer->Commit();
+      FP_RETURN_IF_ERROR(writer->Commit());
+      if (access_.ledger == nullptr) return absl::OkStatus();
+      return access_.ledger->Stored(caller.name, digest, size);
     }());
   }
 
@@ -79,12 +87,14 @@ class BlobServiceImpl final : public v1::BlobService::Service {
 
  private:
   CoordinatorApi& coordinator_;
+  const ServiceAccess& access_;
 };
 
 }  // namespace
 
-std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator) {
-  return std::make_unique<BlobServiceImpl>(coordinator);
+std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator,
+                                               const ServiceAccess& access) {
+  return std::make_unique<BlobServiceImpl>(coordinator, access);
 }
 
 }  // namespace farpoint

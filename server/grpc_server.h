@@ -1,22 +1,46 @@
 // The coordinator on a socket: BlobService, JobService and WorkerService, gRPC health v1 and
-// reflection.
+// reflection. With TLS every call is held against AccessGuard before its handler runs.
 #pragma once
 
 #include <chrono>
+#include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 
 #include "core/base/status.h"
+#include "proto/tls_files.h"
+#include "server/access_guard.h"
+#include "server/client_ledger.h"
 #include "server/coordinator.h"
+#include "server/server_facts.h"
 
 namespace farpoint {
+
+struct GrpcServerOptions {
+  std::optional<TlsMaterial> tls;  // none: in the clear, and everybody may do everything
+  std::string tokens_file, revoked_file;
+  double calls_per_second = 500;  // of a client
+  size_t max_connections = 8192, max_connections_per_host = 4096;
+  // With TLS: what clients own and may use; its ledger lies in this file (empty: in memory).
+  std::string ledger_file;
+  std::function<bool(const Digest&)> has_blob;                 // ClientLedgerOptions
+  uint64_t max_jobs_per_client = 0, max_bytes_per_client = 0;  // 0: no limit
+  std::string blob_directory;                                  // shared with workers; empty: none
+  // What the coordinator's health is asked for (Diagnose); connections, limits of clients, the
+  // certificate and the shared folder are filled in by this.
+  std::function<ServerFacts()> facts;
+  // Of calls and connections that were refused, at most some in ten seconds.
+  std::function<void(std::string)> refused;
+};
 
 class GrpcServer {
  public:
   // Listens on `address` (host:port, port 0: any free one). kUnavailable if it is taken.
   // `coordinator` must outlive this.
   static absl::StatusOr<std::unique_ptr<GrpcServer>> Start(CoordinatorApi& coordinator,
-                                                           const std::string& address);
+                                                           const std::string& address,
+                                                           GrpcServerOptions options = {});
   virtual ~GrpcServer() = default;  // Shutdown(0)
 
   virtual int port() const = 0;

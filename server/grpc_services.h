@@ -1,21 +1,38 @@
 // The thin layer between messages and CoordinatorApi: decode, call, encode. One .cc per service.
-// The coordinator must outlive them.
+// Everything that is passed in must outlive them.
 #pragma once
 
 #include <grpcpp/support/status.h>
 
+#include <functional>
 #include <memory>
 
+#include "server/access_guard.h"
+#include "server/client_ledger.h"
 #include "server/coordinator.h"
+#include "server/server_facts.h"
 
 namespace grpc {
 class Service;
-}
+class ServerContextBase;
+}  // namespace grpc
 
 namespace farpoint {
 
-std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator);
-std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator);
+// What the services know of their callers.
+struct ServiceAccess {
+  AccessGuard* guard = nullptr;  // null: callers cannot be told apart, everybody may do everything
+  ClientLedger* ledger = nullptr;      // null: nothing is limited for each client
+  std::function<ServerFacts()> facts;  // none: nothing is known
+};
+// Of a call that the guard admitted. kUnauthenticated if its certificate has expired meanwhile.
+absl::StatusOr<Caller> CallerOf(const grpc::ServerContextBase& context,
+                                const ServiceAccess& access);
+
+std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator,
+                                               const ServiceAccess& access);
+std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator,
+                                              const ServiceAccess& access);
 std::unique_ptr<grpc::Service> MakeWorkerService(CoordinatorApi& coordinator);
 
 }  // namespace farpoint

@@ -1,7 +1,9 @@
 #include <algorithm>
+#include <chrono>
 
 #include "proto/convert.h"
 #include "proto/farpoint.grpc.pb.h"
+#include "proto/grpc_channel.h"
 #include "proto/grpc_status.h"
 #include "server/grpc_services.h"
 
@@ -13,14 +15,23 @@ constexpr std::chrono::milliseconds kWatchPeriod{500};
 
 class JobServiceImpl final : public v1::JobService::Service {
  public:
-  explicit JobServiceImpl(CoordinatorApi& coordinator) : coordinator_(coordinator) {}
+  JobServiceImpl(CoordinatorApi& coordinator, const ServiceAccess& access)
+      : coordinator_(coordinator), access_(access) {}
 
-  grpc::Status Submit(grpc::ServerContext*, const v1::SubmitRequest* request,
+  grpc::Status Submit(grpc::ServerContext* context, const v1::SubmitRequest* request,
                       v1::SubmitResponse* response) override {
     return ToGrpc([&]() -> absl::Status {
-      FP_RETURN_IF_ERROR(CheckProtocolVersion(request->protocol_version(), "client"));
+      FP_RETURN_IF_ERROR(
+          AgreeOnProtocol(request->oldest_protocol_version(), request->protocol_version(), "client")
+              .status());
+      FP_RETURN_IF_ERROR(CheckFieldsKnown(request->job(), "job"));
+      FP_ASSIGN_OR_RETURN(const Caller caller, CallerOf(*context, access_));
       FP_ASSIGN_OR_RETURN(const JobSpec spec, JobFromWire(request->job()));
+      if (access_.ledger != nullptr) FP_RETURN_IF_ERROR(access_.ledger->MaySubmit(caller.name));
       FP_ASSIGN_OR_RETURN(const JobId id, coordinator_.Submit(spec, request->submission_id()));
+      if (access_.ledger != nullptr) {
+        FP_RETURN_IF_ERROR(access_.ledger->Submitted(caller.name, id));
+      }
       response->set_job_id(id.value);
       return absl::OkStatus();
     }());
@@ -31,10 +42,10 @@ class JobServiceImpl final : public v1::JobService::Service {
     return ToGrpc([&]() -> absl::Status {
       if (!request->job_id().empty()) {
         FP_ASSIGN_OR_RETURN(const JobStatus status, coordinator_.Status({request->job_id()}));
-        *response->add_jobs() = ToWire(status);
+        *response->add_jobs() = Described(status);
         return absl::OkStatus();
       }
-      for (const JobStatus& status : coordinator_.Jobs()) *response->add_jobs() = ToWire(status);
+      for (const JobStatus& status : coordinator_.Jobs()) *response->add_jobs() = Described(status);
       for (const WorkerStatus& status : coordinator_.Workers()) {
         *response->add_workers() = ToWire(status);
       }
@@ -42,32 +53,75 @@ class JobServiceImpl final : public v1::JobService::Service {
     }());
   }
 
-  grpc::Status Cancel(grpc::ServerContext*, const v1::CancelRequest* request,
+  grpc::Status Cancel(grpc::ServerContext* context, const v1::CancelRequest* request,
                       v1::CancelResponse*) override {
-    return ToGrpc(coordinator_.Cancel({request->job_id()}));
+    return ToGrpc([&]() -> absl::Status {
+      FP_RETURN_IF_ERROR(MayChange(*context, {request->job_id()}));
+      return coordinator_.Cancel({request->job_id()});
+    }());
   }
 
-  grpc::Status Pause(grpc::ServerContext*, const v1::PauseRequest* request,
+  grpc::Status Pause(grpc::ServerContext* context, const v1::PauseRequest* request,
                      v1::PauseResponse*) override {
-    return ToGrpc(coordinator_.Pause({request->job_id()}));
+    return ToGrpc([&]() -> absl::Status {
+      FP_RETURN_IF_ERROR(MayChange(*context, {request->job_id()}));
+      return coordinator_.Pause({request->job_id()});
+    }());
   }
-  grpc::Status Resume(grpc::ServerContext*, const v1::ResumeRequest* request,
+  grpc::Status Resume(grpc::ServerContext* context, const v1::ResumeRequest* request,
                       v1::ResumeResponse*) override {
-    return ToGrpc(coordinator_.Resume({request->job_id()}));
+    return ToGrpc([&]() -> absl::Status {
+      FP_RETURN_IF_ERROR(MayChange(*context, {request->job_id()}));
+      return coordinator_.Resume({request->job_id()});
+    }());
   }
-  grpc::Status SetPriority(grpc::ServerContext*, const v1::SetPriorityRequest* request,
+  grpc::Status SetPriority(grpc::ServerContext* context, const v1::SetPriorityRequest* request,
                            v1::SetPriorityResponse*) override {
-    return ToGrpc(coordinator_.SetPriority({request->job_id()}, request->priority()));
+    return ToGrpc([&]() -> absl::Status {
+      FP_RETURN_IF_ERROR(MayChange(*context, {request->job_id()}));
+      return coordinator_.SetPriority({request->job_id()}, request->priority());
+    }());
   }
-  grpc::Status Requeue(grpc::ServerContext*, const v1::RequeueRequest* request,
+  grpc::Status Requeue(grpc::ServerContext* context, const v1::RequeueRequest* request,
                        v1::RequeueResponse*) override {
-    return ToGrpc(coordinator_.Requeue({request->job_id()}, request->all()));
+    return ToGrpc([&]() -> absl::Status {
+      FP_RETURN_IF_ERROR(MayChange(*context, {request->job_id()}));
+      return coordinator_.Requeue({request->job_id()}, request->all());
+    }());
   }
   grpc::Status Explain(grpc::ServerContext*, const v1::ExplainRequest* request,
                        v1::ExplainResponse* response) override {
     return ToGrpc([&]() -> absl::Status {
       FP_ASSIGN_OR_RETURN(const Explanation explanation, coordinator_.Explain({request->job_id()}));
       *response = ToWire(explanation);
+      return absl::OkStatus();
+    }());
+  }
+
+  grpc::Status Diagnose(grpc::ServerContext* context, const v1::DiagnoseRequest*,
+                        v1::DiagnoseResponse* response) override {
+    return ToGrpc([&]() -> absl::Status {
+      FP_ASSIGN_OR_RETURN(const Caller caller, CallerOf(*context, access_));
+      CoordinatorHealth health;
+      if (access_.facts) health = HealthOf(access_.facts());
+      health.version = FARPOINT_VERSION;
+      health.protocol_version = kProtocolVersion;
+      health.oldest_protocol_version = kOldestProtocolVersion;
+      health.unix_ms = std::chrono::duration_cast<std::chrono::milliseconds>(
+                           std::chrono::system_clock::now().time_since_epoch())
+                           .count();
+      if (access_.guard != nullptr) {
+        health.caller_name = caller.name;
+        health.caller_role = std::string(NameOf(caller.role));
+      }
+      if (access_.ledger != nullptr) {
+        FP_ASSIGN_OR_RETURN(const ClientLedger::Use use, access_.ledger->UseOf(caller.name));
+        health.jobs = use.jobs;
+        health.bytes = use.bytes;
+      }
+      health.max_request_bytes = kMaxRequestBytes;
+      health.workers = coordinator_.Workers();
+      *response = ToWire(health);
       return absl::OkStatus();
     }());
   }
@@ -118,6 +172,46 @@ class JobServiceImpl final : public v1::JobService::Service {
   }
 
  private:
+  // Its owner's, or an admin's to change.
+  absl::Status MayChange(const grpc::ServerContext& context, const JobId& job) {
+    FP_ASSIGN_OR_RETURN(const Caller caller, CallerOf(context, access_));
+    if (caller.role == Role::kAdmin || access_.ledger == nullptr) return absl::OkStatus();
+    FP_RETURN_IF_ERROR(coordinator_.Status(job).status());  // kNotFound before whose it is
+    const std::string owner = access_.ledger->OwnerOf(job);
+    if (owner == caller.name) return absl::OkStatus();
+    return absl::PermissionDeniedError(
+        "job " + job.value + " is " + (owner.empty() ? "nobody's" : "'" + owner + "''s") +
+        ", not '" + caller.name + "''s; ask an admin (farpoint certs add NAME --role admin)");
+  }
+
+  v1::JobStatus Described(const JobStatus& status) {
+    v1::JobStatus wire = ToWire(status);
+    if (access_.ledger != nullptr) wire.set_owner(access_.ledger->OwnerOf(status.id));
+    return wire;
+  }
+
+  static CoordinatorHealth HealthOf(const ServerFacts& facts) {
+    CoordinatorHealth health;
+    health.draining = facts.draining;
+    health.store_error = facts.store_error;
+    health.store_free_bytes = facts.disk.free_bytes;
+    health.store_total_bytes = facts.disk.total_bytes;
+    health.memory_available_bytes = facts.memory.available_bytes;
+    health.memory_total_bytes = facts.memory.total_bytes;
+    health.open_files = facts.files.open;
+    health.open_files_limit = facts.files.limit;
+    health.connections = facts.connections;
+    health.max_connections = facts.max_connections;
+    health.max_blob_bytes = facts.max_blob_bytes;
+    health.limits = facts.limits;
+    health.max_jobs = facts.max_jobs;
+    health.max_bytes = facts.max_bytes;
+    health.blob_directory = facts.blob_directory;
+    health.blob_mark = facts.blob_mark;
+    health.certificate_not_after_s = facts.certificate_not_after_s;
+    return health;
+  }
+
   static absl::Status SendTile(const TileData& data, grpc::ServerWriter<v1::TileChunk>& stream) {
     const std::span<const std::byte> bytes = data.bytes.bytes();
     v1::TileChunk chunk;
@@ -136,12 +230,14 @@ class JobServiceImpl final : public v1::JobService::Service {
   }
 
   CoordinatorApi& coordinator_;
+  const ServiceAccess& access_;
 };
 
 }  // namespace
 
-std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator) {
-  return std::make_unique<JobServiceImpl>(coordinator);
+std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator,
+                                              const ServiceAccess& access) {
+  return std::make_unique<JobServiceImpl>(coordinator, access);
 }
 
 }  // namespace farpoint

@@ -1,11 +1,15 @@
 // farpoint-server: flags, log, signals. Everything else is the coordinator's.
+#include <unistd.h>
+
 #include <CLI/CLI.hpp>
 #include <chrono>
 #include <cstdio>
 #include <string>
 
 #include "core/base/blob.h"
+#include "core/base/machine.h"
 #include "proto/service_main.h"
+#include "proto/tls_files.h"
 #include "server/coordinator.h"
 #include "server/grpc_server.h"
 #include "server/scene_baker.h"
@@ -24,7 +28,39 @@ struct ServerFlags {
   uint64_t max_blob_bytes = uint64_t{1} << 36;
   uint64_t bake_cache_mib = kDefaultBakeCacheBytes >> 20;
   JobLimits limits;
+  TlsFlags tls;
+  std::string tokens, revoked;
+  uint64_t max_connections = 8192, max_connections_per_host = 4096, max_calls_per_second = 500;
+  uint64_t max_jobs_per_client = 1000, max_bytes_per_client = uint64_t{1} << 40;
 };
+
+void DefineSecurityFlags(CLI::App& app, ServerFlags& flags) {
+  app.add_option(
+      "--certs", flags.tls.directory,
+      "Folder of farpoint certs: speak TLS, with its ca.pem, server.pem, server.key, tokens "
+      "and revoked");
+  app.add_option("--tls-ca", flags.tls.paths.ca, "The authority's certificate, if not in --certs");
+  app.add_option("--tls-cert", flags.tls.paths.certificate, "The coordinator's certificate");
+  app.add_option("--tls-key", flags.tls.paths.key, "Its key");
+  app.add_option("--tokens", flags.tokens,
+                 "Tokens that stand in for a client's certificate "
+                 "[tokens in --certs]");
+  app.add_option("--revoked", flags.revoked,
+                 "Certificates that count no longer [revoked in --certs]");
+  app.add_flag("--insecure", flags.tls.insecure,
+               "Listen beyond this machine without TLS: who reaches the port can do everything");
+  const auto limit = [&app](const char* name, uint64_t& value, const char* text) {
+    app.add_option(name, value, text)
+        ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 62))
+        ->capture_default_str();
+  };
+  limit("--max-connections", flags.max_connections, "Most connections");
+  limit("--max-connections-per-host", flags.max_connections_per_host,
+        "Most connections of one host");
+  limit("--max-calls-per-second", flags.max_calls_per_second, "Of a client; with TLS only");
+  limit("--max-jobs-per-client", flags.max_jobs_per_client, "Not ended; with TLS only");
+  limit("--max-bytes-per-client", flags.max_bytes_per_client, "Of scene files; with TLS only");
+}
 
 void DefineFlags(CLI::App& app, ServerFlags& flags) {
   app.set_version_flag("--version", "farpoint-server " FARPOINT_VERSION);
@@ -62,6 +98,54 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
   number("--max-seconds", flags.limits.max_seconds, 1, "Longest rendering time of a job");
 }
 
+// What the flags say of who may connect and do what.
+absl::StatusOr<GrpcServerOptions> ServerOptionsOf(const ServerFlags& flags) {
+  GrpcServerOptions options;
+  if (flags.tls.empty()) {
+    FP_RETURN_IF_ERROR(Annotate(CheckMayBePlain(flags.tls, flags.listen), "--listen"));
+  } else {
+    FP_ASSIGN_OR_RETURN(const TlsPaths paths, FindTls(flags.tls, Role::kServer));
+    FP_ASSIGN_OR_RETURN(options.tls, LoadTls(paths, TlsUse::kServer, NowUnixS()));
+    if (options.tls->facts.role != Role::kServer) {
+      return absl::FailedPreconditionError("'" + paths.certificate + "': has the role " +
+                                           std::string(NameOf(options.tls->facts.role)) +
+                                           ", a coordinator's has server; see farpoint certs add");
+    }
+  }
+  const std::string& folder = flags.tls.directory;
+  const auto in_folder = [&](const std::string& given, const char* name) {
+    return given.empty() && !folder.empty() ? folder + "/" + name : given;
+  };
+  options.tokens_file = in_folder(flags.tokens, "tokens");
+  options.revoked_file = in_folder(flags.revoked, "revoked");
+  options.max_connections = flags.max_connections;
+  options.max_connections_per_host = flags.max_connections_per_host;
+  options.calls_per_second = static_cast<double>(flags.max_calls_per_second);
+  options.max_jobs_per_client = flags.max_jobs_per_client;
+  options.max_bytes_per_client = flags.max_bytes_per_client;
+  // Each connection takes a descriptor; the store, blobs and bakes take some, too.
+  constexpr uint64_t kOtherFiles = 256;
+  const uint64_t files = RaiseOpenFileLimit();
+  if (files < options.max_connections + kOtherFiles) {
+    options.max_connections = std::max<uint64_t>(files / 2, files - std::min(files, kOtherFiles));
+  }
+  options.ledger_file = flags.store + "/clients.sqlite";
+  std::string blobs = flags.store + "/blobs";
+  options.has_blob = [blobs](const Digest& digest) {
+    return ::access((blobs + "/" + digest.Hex()).c_str(), F_OK) == 0;
+  };
+  options.facts = [store = flags.store, limits = flags.limits,
+                   max_blob_bytes = flags.max_blob_bytes] {
+    ServerFacts facts;
+    LookAround(store, facts);
+    facts.limits = limits;
+    facts.max_blob_bytes = max_blob_bytes;
+    return facts;
+  };
+  options.refused = [](std::string text) { WriteLog(LogLevel::kWarning, text); };
+  return options;
+}
+
 void LogEntry(const CoordinatorLogEntry& entry) {
   WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, entry.worker, entry.text));
 }
@@ -70,6 +154,7 @@ int Main(int argc, char** argv) {
   ServerFlags flags;
   CLI::App app{"farpoint-server: takes jobs, bakes their scenes, hands tiles to workers."};
   DefineFlags(app, flags);
+  DefineSecurityFlags(app, flags);
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {
@@ -82,6 +167,19 @@ int Main(int argc, char** argv) {
   }
   StartLog(kProgram, flags.log_level);
   const StopSignals signals;
+  absl::StatusOr<GrpcServerOptions> server_options = ServerOptionsOf(flags);
+  if (!server_options.ok()) {
+    ReportFatal(kProgram, server_options.status());
+    return absl::IsInvalidArgument(server_options.status()) ? kServiceExitUsage
+                                                            : kServiceExitPermanent;
+  }
+  const bool tls = server_options->tls.has_value();
+  if (!tls && !IsLoopback(flags.listen)) {
+    WriteLog(
+        LogLevel::kWarning,
+        "--insecure: no encryption and no authentication on " + flags.listen +
+            "; whoever reaches this port can read all scenes, submit jobs and pose as a worker");
+  }
 
   CoordinatorOptions options;
   options.store_directory = flags.store;
@@ -108,7 +206,7 @@ int Main(int argc, char** argv) {
     return ReportFatal(kProgram, coordinator.status());
   }
   absl::StatusOr<std::unique_ptr<GrpcServer>> server =
-      GrpcServer::Start(**coordinator, flags.listen);
+      GrpcServer::Start(**coordinator, flags.listen, *std::move(server_options));
   if (!server.ok()) {
     return ReportFatal(kProgram, server.status());
   }
@@ -122,7 +220,8 @@ int Main(int argc, char** argv) {
   std::printf("listening on %s:%s\n", host.c_str(), port.c_str());
   std::fflush(stdout);
   WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " listening on " + host +
-                                ":" + port + ", store '" + flags.store + "'");
+                                ":" + port + (tls ? ", TLS" : ", in the clear") + ", store '" +
+                                flags.store + "'");
 
   while (!signals.Wait(std::chrono::hours(1))) {
   }

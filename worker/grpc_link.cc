@@ -20,8 +20,10 @@ constexpr std::chrono::milliseconds kStreamTimeout{600000};
 
 class GrpcLinkImpl final : public GrpcLink {
  public:
-  explicit GrpcLinkImpl(const std::string& address)
-      : channel_(OpenChannel(address)),
+  GrpcLinkImpl(const std::string& address, const ChannelSecurity& security)
+      : channel_(OpenChannel(address, security)),
+        address_(address),
+        security_(security),
         workers_(v1::WorkerService::NewStub(channel_)),
         blobs_(v1::BlobService::NewStub(channel_)) {}
 
@@ -29,7 +31,8 @@ class GrpcLinkImpl final : public GrpcLink {
     grpc::ClientContext context;
     SetDeadline(context, kCallTimeout);
     v1::RegisterResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(workers_->Register(&context, ToWire(hello), &response)));
+    FP_RETURN_IF_ERROR(ExplainFailure(
+        FromGrpc(workers_->Register(&context, ToWire(hello), &response)), address_, security_));
     return WelcomeFromWire(response);
   }
 
@@ -149,6 +152,8 @@ class GrpcLinkImpl final : public GrpcLink {
 
  private:
   const std::shared_ptr<grpc::Channel> channel_;
+  const std::string address_;
+  const ChannelSecurity security_;
   const std::unique_ptr<v1::WorkerService::Stub> workers_;
   const std::unique_ptr<v1::BlobService::Stub> blobs_;
   std::mutex mutex_;
@@ -158,8 +163,9 @@ class GrpcLinkImpl final : public GrpcLink {
 
 }  // namespace
 
-std::unique_ptr<GrpcLink> GrpcLink::Connect(const std::string& address) {
-  return std::make_unique<GrpcLinkImpl>(address);
+std::unique_ptr<GrpcLink> GrpcLink::Connect(const std::string& address,
+                                            const ChannelSecurity& security) {
+  return std::make_unique<GrpcLinkImpl>(address, security);
 }
 
 }  // namespace farpoint

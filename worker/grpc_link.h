@@ -5,14 +5,17 @@
 #include <memory>
 #include <string>
 
+#include "proto/connection_probe.h"
 #include "worker/coordinator_link.h"
 
 namespace farpoint {
 
 class GrpcLink : public CoordinatorLink, public BlobStreamer {
  public:
-  // `address`: host:port.
-  static std::unique_ptr<GrpcLink> Connect(const std::string& address);
+  // `address`: host:port. Register says why a connection fails, where that can be found out
+  // (proto/connection_probe.h).
+  static std::unique_ptr<GrpcLink> Connect(const std::string& address,
+                                           const ChannelSecurity& security = {});
 };
 
 }  // namespace farpoint

@@ -11,6 +11,7 @@
 
 #include "core/base/executor.h"
 #include "proto/service_main.h"
+#include "proto/tls_files.h"
 #include "worker/blob_cache.h"
 #include "worker/fingerprint.h"
 #include "worker/grpc_link.h"
@@ -28,6 +29,7 @@ struct WorkerFlags {
   uint64_t cache_bytes = uint64_t{64} << 30;
   uint64_t cached_scenes = 2;
   uint64_t drain_seconds = 10;
+  TlsFlags tls;
 };
 
 std::string DefaultCache() {
@@ -56,6 +58,14 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
   app.add_option("--cache-bytes", flags.cache_bytes, "Most bytes in the cache")
       ->check(CLI::Range(uint64_t{1} << 20, uint64_t{1} << 62))
       ->capture_default_str();
+  app.add_option(
+      "--certs", flags.tls.directory,
+      "Folder of farpoint certs: speak TLS, with its ca.pem and the worker's certificate");
+  app.add_option("--tls-ca", flags.tls.paths.ca, "The authority's certificate, if not in --certs");
+  app.add_option("--tls-cert", flags.tls.paths.certificate, "The worker's certificate");
+  app.add_option("--tls-key", flags.tls.paths.key, "Its key");
+  app.add_flag("--insecure", flags.tls.insecure,
+               "Talk without TLS to a coordinator that is not on this machine");
   app.add_option("--threads", flags.threads, "Threads; 0: all cores")->capture_default_str();
   app.add_option("--name", flags.name, "Shown by `farpoint status`")->capture_default_str();
   app.add_option("--cached-scenes", flags.cached_scenes, "Scenes kept in memory")
@@ -72,6 +82,22 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
 
 void LogEntry(const WorkerLogEntry& entry) {
   WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, {}, entry.text));
+}
+
+// How to reach the coordinator. kInvalidArgument: the flags contradict each other.
+absl::StatusOr<ChannelSecurity> SecurityOf(const WorkerFlags& flags) {
+  ChannelSecurity security;
+  if (flags.tls.empty()) {
+    FP_RETURN_IF_ERROR(Annotate(CheckMayBePlain(flags.tls, flags.coordinator), "--coordinator"));
+    return security;
+  }
+  FP_ASSIGN_OR_RETURN(const TlsPaths paths, FindTls(flags.tls, Role::kWorker));
+  FP_ASSIGN_OR_RETURN(security.tls, LoadTls(paths, TlsUse::kPeer, NowUnixS()));
+  if (security.tls->certificate.empty()) {
+    return absl::InvalidArgumentError(
+        "--tls-cert: not given; a worker needs a certificate, tokens are for clients");
+  }
+  return security;
 }
 
 int Main(int argc, char** argv) {
@@ -97,6 +123,15 @@ int Main(int argc, char** argv) {
   }
   StartLog(kProgram, flags.log_level);
   const StopSignals signals;
+  const absl::StatusOr<ChannelSecurity> security = SecurityOf(flags);
+  if (!security.ok()) {
+    ReportFatal(kProgram, security.status());
+    return absl::IsInvalidArgument(security.status()) ? kServiceExitUsage : kServiceExitPermanent;
+  }
+  if (!security->tls && !IsLoopback(flags.coordinator)) {
+    WriteLog(LogLevel::kWarning, "--insecure: whoever is on the way to " + flags.coordinator +
+                                     " can read scenes and change pixels");
+  }
 
   WorkerOptions options;
   {
@@ -113,7 +148,7 @@ int Main(int argc, char** argv) {
   options.drain_time = std::chrono::seconds(flags.drain_seconds);
   options.log = LogEntry;
 
-  const std::unique_ptr<GrpcLink> link = GrpcLink::Connect(flags.coordinator);
+  const std::unique_ptr<GrpcLink> link = GrpcLink::Connect(flags.coordinator, *security);
   const absl::StatusOr<std::unique_ptr<BlobCache>> cache =
       BlobCache::Open({.directory = flags.cache,
                        .max_bytes = flags.cache_bytes,

@@ -32,6 +32,8 @@ class Descriptor {
   }
   int get() const { return fd_; }
   bool valid() const { return fd_ >= 0; }
+  // Somebody else closes it.
+  int Release() { return std::exchange(fd_, -1); }
   void Reset(int fd = -1);
 
  private:

@@ -531,13 +531,81 @@ TEST(Convert, WorkerStatusSurvivesTheWire) {
   EXPECT_EQ(ToWire(*back).SerializeAsString(), ToWire(status).SerializeAsString());
 }
 
-TEST(Convert, AnotherProtocolIsRefusedAndSaysWhomToUpdate) {
-  EXPECT_TRUE(CheckProtocolVersion(kProtocolVersion, "worker").ok());
-  const absl::Status older = CheckProtocolVersion(kProtocolVersion - 1, "worker");
+TEST(Convert, NeighbouringProtocolsAgreeOnTheNewestThatBothSpeak) {
+  for (uint32_t version = kOldestProtocolVersion; version <= kProtocolVersion; ++version) {
+    EXPECT_EQ(*AgreeOnProtocol(0, version, "worker"), version);
+  }
+  // A newer peer that still speaks ours.
+  EXPECT_EQ(*AgreeOnProtocol(kProtocolVersion, kProtocolVersion + 2, "worker"), kProtocolVersion);
+  EXPECT_EQ(*AgreeOnProtocol(1, kOldestProtocolVersion, "worker"), kOldestProtocolVersion);
+  EXPECT_EQ(*AgreeOnProtocol(1, kProtocolVersion + 5, "worker"), kProtocolVersion);
+  // What makes no sense is read as one version.
+  EXPECT_EQ(*AgreeOnProtocol(kProtocolVersion + 3, kProtocolVersion, "worker"), kProtocolVersion);
+}
+
+TEST(Convert, ProtocolsTooFarApartAreRefusedAndItSaysWhomToUpdate) {
+  const absl::Status older = AgreeOnProtocol(0, kOldestProtocolVersion - 1, "worker").status();
   EXPECT_TRUE(absl::IsFailedPrecondition(older));
   EXPECT_THAT(std::string(older.message()), HasSubstr("update the worker"));
-  const absl::Status newer = CheckProtocolVersion(kProtocolVersion + 1, "worker");
+  const absl::Status newer =
+      AgreeOnProtocol(kProtocolVersion + 1, kProtocolVersion + 4, "client").status();
+  EXPECT_TRUE(absl::IsFailedPrecondition(newer));
   EXPECT_THAT(std::string(newer.message()), HasSubstr("update the coordinator"));
+}
+
+// What a newer client knows and this coordinator does not would be left out of the image in
+// silence.
+TEST(Convert, FieldsOfANewerVersionAreFoundAtAnyDepth) {
+  const JobSpec spec;
+  v1::RenderJob job = ToWire(spec);
+  EXPECT_TRUE(CheckFieldsKnown(job, "job").ok());
+  job.mutable_overrides()
+      ->add_lights()
+      ->mutable_position()
+      ->GetReflection()
+      ->MutableUnknownFields(job.mutable_overrides()->mutable_lights(0)->mutable_position())
+      ->AddVarint(77, 1);
+  const absl::Status status = CheckFieldsKnown(job, "job");
+  EXPECT_TRUE(absl::IsFailedPrecondition(status));
+  EXPECT_THAT(std::string(status.message()), HasSubstr("job.overrides.lights[0].position"));
+  EXPECT_THAT(std::string(status.message()), HasSubstr("77"));
+  EXPECT_THAT(std::string(status.message()), HasSubstr("update the coordinator"));
+}
+
+TEST(Convert, ACoordinatorsHealthSurvivesTheWire) {
+  CoordinatorHealth health;
+  health.version = "1.2";
+  health.protocol_version = 7;
+  health.oldest_protocol_version = 5;
+  health.unix_ms = 1234;
+  health.draining = true;
+  health.caller_name = "alice";
+  health.caller_role = "client";
+  health.store_error = "full";
+  health.store_free_bytes = 1;
+  health.store_total_bytes = 2;
+  health.memory_available_bytes = 3;
+  health.memory_total_bytes = 4;
+  health.open_files = 5;
+  health.open_files_limit = 6;
+  health.connections = 7;
+  health.max_connections = 8;
+  health.max_request_bytes = 9;
+  health.max_blob_bytes = 10;
+  health.limits.max_pixels = 11;
+  health.max_jobs = 12;
+  health.max_bytes = 13;
+  health.jobs = 14;
+  health.bytes = 15;
+  health.workers.push_back({.id = {"0badcafe"}, .name = "w", .fingerprint = HashBytes({})});
+  health.blob_directory = "/shared";
+  health.blob_mark = "mark";
+  health.certificate_not_after_s = 16;
+  const auto back = HealthFromWire(ToWire(health));
+  ASSERT_TRUE(back.ok()) << back.status();
+  EXPECT_EQ(ToWire(*back).SerializeAsString(), ToWire(health).SerializeAsString());
+  EXPECT_EQ(back->limits, health.limits);
+  EXPECT_EQ(back->workers.at(0).name, "w");
 }
 
 }  // namespace

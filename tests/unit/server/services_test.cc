@@ -353,9 +353,54 @@ TEST_F(ServicesTest, DamagedUploadsAreRefused) {
   EXPECT_FALSE(coordinator_->GetBlob(digest).ok());
 }
 
+TEST_F(ServicesTest, NeighbouringProtocolsWorkTogether) {
+  const auto submit = [&](uint32_t oldest, uint32_t newest) {
+    v1::SubmitRequest request = Request();
+    request.set_protocol_version(newest);
+    request.set_oldest_protocol_version(oldest);
+    v1::SubmitResponse response;
+    Call call;
+    return jobs_->Submit(&call, request, &response);
+  };
+  EXPECT_TRUE(submit(0, kOldestProtocolVersion).ok()) << "an older client that knows of no range";
+  EXPECT_TRUE(submit(kProtocolVersion, kProtocolVersion + 1).ok()) << "a newer one";
+  v1::RegisterRequest hello = ToWire(WorkerHello{.version = FARPOINT_VERSION,
+                                                 .fingerprint = Sha256().Update("f").Finish(),
+                                                 .threads = 1,
+                                                 .name = "newer"});
+  hello.set_protocol_version(kProtocolVersion + 1);
+  v1::RegisterResponse welcome;
+  Call call;
+  EXPECT_TRUE(workers_->Register(&call, hello, &welcome).ok());
+}
+
+TEST_F(ServicesTest, AJobWithSomethingNewIsRefusedAndNotRenderedWithoutIt) {
+  v1::SubmitRequest request = Request();
+  v1::RenderSettings* settings = request.mutable_job()->mutable_settings();
+  settings->GetReflection()->MutableUnknownFields(settings)->AddVarint(1000, 1);
+  v1::SubmitResponse response;
+  Call call;
+  const grpc::Status status = jobs_->Submit(&call, request, &response);
+  EXPECT_EQ(status.error_code(), grpc::StatusCode::FAILED_PRECONDITION);
+  EXPECT_THAT(status.error_message(), HasSubstr("job.settings"));
+}
+
+TEST_F(ServicesTest, TheCoordinatorSaysHowItIs) {
+  v1::DiagnoseResponse response;
+  Call call;
+  ASSERT_TRUE(jobs_->Diagnose(&call, {}, &response).ok());
+  EXPECT_EQ(response.version(), FARPOINT_VERSION);
+  EXPECT_EQ(response.protocol_version(), kProtocolVersion);
+  EXPECT_EQ(response.oldest_protocol_version(), kOldestProtocolVersion);
+  EXPECT_EQ(response.caller_role(), "") << "without TLS nobody is known";
+  EXPECT_GE(response.connections(), 1u);
+  EXPECT_GT(response.unix_ms(), 1'600'000'000'000);
+}
+
 TEST_F(ServicesTest, AnotherProtocolIsRefusedClearly) {
   v1::SubmitRequest request = Request();
   request.set_protocol_version(kProtocolVersion + 1);
+  request.set_oldest_protocol_version(kProtocolVersion + 1);
   v1::SubmitResponse response;
   Call call;
   const grpc::Status status = jobs_->Submit(&call, request, &response);
