@@ -298,6 +298,9 @@ constexpr VerbInfo kVerbs[] = {
     {Verb::kLogs, "logs", "what happened to a job"},
     {Verb::kExplain, "explain", "why a job is in the state that it is in"},
     {Verb::kCompare, "compare", "measure how an image differs from a reference"},
+    {Verb::kCerts, "certs",
+     "make certificates and tokens for a farm: init, add, show, token, revoke"},
+    {Verb::kDoctor, "doctor", "find out what keeps a farm from working, and say what to do"},
 };
 
 constexpr char kOverview[] =
@@ -315,11 +318,14 @@ constexpr char kOverview[] =
     "  farpoint explain JOB\n"
     "  farpoint workers\n"
     "  farpoint compare IMAGE REFERENCE [--layer NAME] [--mask FILE] [--json FILE]\n"
+    "  farpoint certs init | add | show | token | revoke [NAME] [--dir DIR]\n"
+    "  farpoint doctor [SCENE] [--coordinator HOST:PORT]\n"
     "\n"
     "  farpoint COMMAND --help     the flags of a command\n"
     "  farpoint --version\n"
     "\n"
-    "SCENE is a scene file or a job file .json. FARPOINT_COORDINATOR stands in for --coordinator.\n"
+    "SCENE is a scene file or a job file .json. FARPOINT_COORDINATOR stands in for --coordinator,\n"
+    "FARPOINT_CERTS for --certs.\n"
     "Exit codes: 0 done; 2 wrong usage; 42 the scene or the settings are wrong; 75 try again;\n"
     "130, 143 stopped by a signal.\n";
 
@@ -333,6 +339,9 @@ struct Parsed {
   std::string frames;
   std::string log_level = "info";
   std::string config;
+  std::string certs_action, certs_role;
+  std::optional<uint32_t> days;
+  std::optional<uint64_t> points;
 };
 
 void DeclareCommon(Options& options, CommandLine& line, Parsed& parsed) {
@@ -344,11 +353,25 @@ void DeclareCommon(Options& options, CommandLine& line, Parsed& parsed) {
                "General");
 }
 
+void DeclareSecurity(Options& options, CommandLine& line) {
+  options.Text("--certs", "DIR", line.tls.directory,
+               "folder of farpoint certs: speak TLS; default: FARPOINT_CERTS", "Farm");
+  options.Text("--tls-ca", "FILE", line.tls.paths.ca,
+               "the authority's certificate, if not in --certs", "Farm");
+  options.Text("--tls-cert", "FILE", line.tls.paths.certificate, "one's own certificate", "Farm");
+  options.Text("--tls-key", "FILE", line.tls.paths.key, "its key", "Farm");
+  options.Text("--token-file", "FILE", line.token_file,
+               "a token in place of a certificate; with --tls-ca or --certs", "Farm");
+  options.Flag("--insecure", line.tls.insecure,
+               "talk without TLS to a coordinator that is not on this machine", "Farm");
+}
+
 void DeclareCoordinator(Options& options, CommandLine& line, Parsed& parsed) {
   options.Text("--coordinator", "HOST:PORT", line.coordinator,
                "the farm's coordinator; default: FARPOINT_COORDINATOR", "Farm");
   options.Number<double>("--patience", "SECONDS", parsed.patience, 0, 1e6,
                          "how long an unreachable coordinator is waited for; default 60", "Farm");
+  DeclareSecurity(options, line);
 }
 
 void DeclareImage(Options& options, CommandLine& line, Parsed& parsed) {
@@ -458,6 +481,45 @@ void Declare(Options& options, CommandLine& line, Parsed& parsed) {
       options.Text("--diff", "FILE.png", line.diff, "the absolute difference in false colour",
                    "Output");
       options.Text("--json", "FILE", line.json, "the measures; - for stdout", "Output");
+      break;
+    case Verb::kCerts:
+      options.Positional(
+          "ACTION", parsed.certs_action,
+          "init: a farm's authority, server, workers and clients; add NAME: one more "
+          "certificate; show; token NAME: a token for a client; revoke NAME");
+      options.Positional("NAME", line.certs_name, "add, token, revoke: whose");
+      options.Text("--dir", "DIR", line.certs_directory, "the folder; default: farpoint-certs",
+                   "Farm");
+      options.List(
+          "--server", "HOST[,HOST]", line.certs_hosts,
+          "init, add: the names and addresses by which the coordinator is reached; default: "
+          "this machine's",
+          "Certificates");
+      options.Number<uint32_t>("--workers", "N", parsed.workers, 0, 10000,
+                               "init: certificates for so many workers; default 1", "Certificates");
+      options.List("--clients", "NAME[,NAME]", line.certs_clients, "init: clients; default: client",
+                   "Certificates");
+      options.Text("--role", "ROLE", parsed.certs_role,
+                   "add: worker, client (the default), admin or server; token: client or admin",
+                   "Certificates");
+      options.Number<uint32_t>("--days", "N", parsed.days, 1, 36500,
+                               "how long it holds; default 365", "Certificates");
+      break;
+    case Verb::kDoctor:
+      options.Positional("SCENE", line.scene, "a scene: can it be rendered here and on the farm?");
+      DeclareFarm(options, line, parsed, "what was found, as JSON; - for stdout");
+      options.Text("--role", "ROLE", parsed.certs_role,
+                   "whose certificate of --certs: client (the default), worker or server", "Farm");
+      options.Text("--store", "DIR", line.store, "look at a coordinator's store on this machine",
+                   "This machine");
+      options.Text("--listen", "HOST:PORT", line.listen, "can a coordinator listen there?",
+                   "This machine");
+      options.Text("--cache", "DIR", line.cache, "look at a worker's cache on this machine",
+                   "This machine");
+      options.Text("--blob-dir", "DIR", line.blob_dir,
+                   "is this the folder that the coordinator shares its blobs in?", "This machine");
+      options.Number<uint64_t>("--points", "N", parsed.points, 1, uint64_t{1} << 40,
+                               "surfels that the scene shall have", "This machine");
       break;
   }
   DeclareCommon(options, line, parsed);
@@ -580,7 +642,31 @@ absl::Status CheckJobs(const CommandLine& line) {
   return absl::OkStatus();
 }
 
+absl::Status CheckCerts(const CommandLine& line) {
+  const bool named = line.certs_action == CertsAction::kAdd ||
+                     line.certs_action == CertsAction::kToken ||
+                     line.certs_action == CertsAction::kRevoke;
+  if (named && line.certs_name.empty()) return Bad("NAME: not given; say whose it is");
+  if (!named && !line.certs_name.empty()) {
+    return Bad("'" + line.certs_name + "' is one argument too many; see farpoint certs --help");
+  }
+  if (line.certs_action == CertsAction::kAdd && line.certs_role != Role::kServer &&
+      !line.certs_hosts.empty()) {
+    return Bad("--server: only a server's certificate names hosts; say --role server");
+  }
+  if (line.certs_action == CertsAction::kToken && line.certs_role != Role::kClient &&
+      line.certs_role != Role::kAdmin) {
+    return Bad("--role: a token is a client's or an admin's; a " +
+               std::string(NameOf(line.certs_role)) + " needs a certificate");
+  }
+  return absl::OkStatus();
+}
+
 absl::Status CheckNeeds(const CommandLine& line) {
+  if (line.verb == Verb::kCerts) return CheckCerts(line);
+  if (line.verb == Verb::kDoctor) {
+    return line.coordinator.empty() ? absl::OkStatus() : CheckCoordinator(line.coordinator);
+  }
   const bool renders = line.verb == Verb::kRender || line.verb == Verb::kSubmit;
   if (renders) {
     if (line.scene.empty()) {
@@ -678,6 +764,29 @@ absl::StatusOr<CommandLine> ParseCommandLine(std::span<const std::string> args,
     FP_RETURN_IF_ERROR(Annotate(frames.status(), "--frames " + parsed.frames));
     line.frames = *std::move(frames);
   }
+  if (line.verb == Verb::kCerts) {
+    constexpr const char* kActions[] = {"init", "add", "show", "token", "revoke"};
+    const auto* action = std::find(std::begin(kActions), std::end(kActions), parsed.certs_action);
+    if (action == std::end(kActions)) {
+      return Bad(parsed.certs_action.empty()
+                     ? "ACTION: not given; say init, add, show, token or revoke"
+                     : parsed.certs_action +
+                           ": unknown action; say init, add, show, token or revoke");
+    }
+    line.certs_action = static_cast<CertsAction>(action - std::begin(kActions));
+    if (line.certs_directory.empty()) line.certs_directory = "farpoint-certs";
+    line.certs_days = parsed.days.value_or(line.certs_days);
+  }
+  if (!parsed.certs_role.empty()) {
+    const std::optional<Role> role = RoleFromName(parsed.certs_role);
+    if (!role)
+      return Bad("--role " + parsed.certs_role + ": expected worker, client, admin or server");
+    line.certs_role = line.doctor_role = *role;
+  } else if (line.verb == Verb::kCerts && line.certs_action == CertsAction::kAdd &&
+             !line.certs_hosts.empty()) {
+    line.certs_role = Role::kServer;
+  }
+  line.points = parsed.points.value_or(0);
   line.farm_ignores = line.verb == Verb::kSubmit && (parsed.workers || parsed.threads);
   line.workers = parsed.workers.value_or(line.workers);
   line.threads = parsed.threads.value_or(line.threads);

@@ -10,6 +10,8 @@
 #include "client/render_flags.h"
 #include "core/base/status.h"
 #include "core/image/exr_io.h"
+#include "proto/access.h"
+#include "proto/tls_files.h"
 
 namespace farpoint {
 
@@ -28,7 +30,12 @@ enum class Verb {
   kLogs,
   kExplain,
   kCompare,
+  kCerts,
+  kDoctor,
 };
+
+// farpoint certs ACTION
+enum class CertsAction { kInit, kAdd, kShow, kToken, kRevoke };
 
 struct CommandLine {
   Verb verb = Verb::kRender;
@@ -40,6 +47,8 @@ struct CommandLine {
   std::string json;         // file for statistics or status; "-": stdout; empty: none
   std::string coordinator;  // HOST:PORT
   double patience_s = 60;   // how long an unreachable coordinator is waited for
+  TlsFlags tls;
+  std::string token_file;  // empty: none
 
   // render, submit
   std::string scene;
@@ -79,6 +88,20 @@ struct CommandLine {
   std::string layer, ref_layer, mask;
   std::string diff;  // false-colour PNG; empty: none
   double noise = 0;
+
+  // certs
+  CertsAction certs_action = CertsAction::kShow;
+  std::string certs_directory;
+  std::string certs_name;                  // add, token, revoke
+  Role certs_role = Role::kClient;         // add, token
+  std::vector<std::string> certs_hosts;    // init, add
+  std::vector<std::string> certs_clients;  // init
+  uint32_t certs_days = 365;
+
+  // doctor; all may be empty
+  std::string store, cache, blob_dir, listen;
+  uint64_t points = 0;
+  Role doctor_role = Role::kClient;  // whose certificate of --certs is looked at
 };
 
 // `args` without the program's name. `environment_coordinator` stands in for --coordinator. Every

@@ -12,6 +12,8 @@
 #include <utility>
 #include <vector>
 
+#include "client/certs.h"
+#include "client/doctor.h"
 #include "client/embedded_farm.h"
 #include "client/exit_code.h"
 #include "client/farm_commands.h"
@@ -57,6 +59,44 @@ Retry MakeRetry(const CommandLine& line, const StopFlag& stop, Console& console)
   RetryPolicy policy;
   policy.patience = std::chrono::milliseconds(static_cast<int64_t>(line.patience_s * 1000));
   return Retry(policy, "coordinator " + line.coordinator, stop, console);
+}
+
+// How the line says that the coordinator is reached. kInvalidArgument: its flags contradict each
+// other.
+absl::StatusOr<ChannelSecurity> SecurityOf(const CommandLine& line, Console& console) {
+  ChannelSecurity security;
+  if (line.tls.empty()) {
+    if (!line.token_file.empty()) {
+      return absl::InvalidArgumentError(
+          "--token-file: without TLS the token could be read on the way; add --tls-ca FILE");
+    }
+    FP_RETURN_IF_ERROR(Annotate(CheckMayBePlain(line.tls, line.coordinator), "--coordinator"));
+    if (!IsLoopback(line.coordinator)) {
+      console.Warn("--insecure: whoever is on the way to " + line.coordinator +
+                   " can read the scene and change the image");
+    }
+    return security;
+  }
+  TlsPaths paths{.ca = line.tls.directory + "/ca.pem"};
+  if (line.token_file.empty() || line.tls.directory.empty()) {
+    FP_ASSIGN_OR_RETURN(paths, FindTls(line.tls, Role::kClient));
+  }
+  if (!line.token_file.empty()) {
+    if (!line.tls.paths.certificate.empty()) {
+      return absl::InvalidArgumentError("--token-file: stands in for --tls-cert; give one of both");
+    }
+    FP_ASSIGN_OR_RETURN(security.token, ReadTokenFile(line.token_file));
+  }
+  FP_ASSIGN_OR_RETURN(security.tls, LoadTls(paths, TlsUse::kPeer, NowUnixS()));
+  return security;
+}
+
+absl::StatusOr<std::unique_ptr<FarmLink>> OpenFarm(const CommandLine& line, const StopFlag& stop,
+                                                   Console& console, bool& usage_error) {
+  const absl::StatusOr<ChannelSecurity> security = SecurityOf(line, console);
+  usage_error = absl::IsInvalidArgument(security.status());
+  FP_RETURN_IF_ERROR(security.status());
+  return MakeGrpcFarmLink(line.coordinator, stop, *security);
 }
 
 absl::StatusOr<ImageWriter> MakeWriter(const CommandLine& line, Console& console) {
@@ -156,7 +196,8 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
     FP_RETURN_IF_ERROR(writer.CheckNames(spec.frame_count(), !spec.frames.empty()));
   }
   usage_error = false;
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
+  FP_ASSIGN_OR_RETURN(const std::unique_ptr<FarmLink> farm,
+                      OpenFarm(line, stop, console, usage_error));
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
   FP_ASSIGN_OR_RETURN(const JobId id, run.Submit(request));
@@ -216,7 +257,8 @@ absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& conso
   usage_error = true;
   FP_ASSIGN_OR_RETURN(ImageWriter writer, MakeWriter(line, console));
   usage_error = false;
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
+  FP_ASSIGN_OR_RETURN(const std::unique_ptr<FarmLink> farm,
+                      OpenFarm(line, stop, console, usage_error));
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
   const JobId id{line.jobs[0]};
@@ -276,9 +318,79 @@ absl::Status Compare(const CommandLine& line, Console& console) {
   return WriteText("-", ComparisonText(result));
 }
 
-absl::Status AskFarm(const CommandLine& line, const StopFlag& stop, Console& console) {
+absl::Status Certs(const CommandLine& line, bool& usage_error) {
+  const int64_t now_s = NowUnixS();
+  absl::StatusOr<std::vector<std::string>> lines;
+  switch (line.certs_action) {
+    case CertsAction::kInit:
+      lines = InitCerts({.directory = line.certs_directory,
+                         .server_hosts = line.certs_hosts,
+                         .workers = line.workers,
+                         .clients = line.certs_clients,
+                         .days = line.certs_days},
+                        now_s);
+      break;
+    case CertsAction::kAdd:
+      lines = AddCertificate({.directory = line.certs_directory,
+                              .name = line.certs_name,
+                              .role = line.certs_role,
+                              .hosts = line.certs_hosts,
+                              .days = line.certs_days},
+                             now_s);
+      break;
+    case CertsAction::kShow:
+      lines = ShowCerts(line.certs_directory, now_s);
+      break;
+    case CertsAction::kRevoke:
+      lines = Revoke(line.certs_directory, line.certs_name, now_s);
+      break;
+    case CertsAction::kToken: {
+      const absl::StatusOr<std::string> token = AddToken({.directory = line.certs_directory,
+                                                          .name = line.certs_name,
+                                                          .role = line.certs_role,
+                                                          .days = line.certs_days},
+                                                         now_s);
+      if (token.ok()) {
+        lines = std::vector<std::string>{*token};
+      } else {
+        lines = token.status();
+      }
+      break;
+    }
+  }
+  usage_error = absl::IsInvalidArgument(lines.status());
+  FP_RETURN_IF_ERROR(lines.status());
+  std::string text;
+  for (const std::string& one : *lines) text += one + "\n";
+  return WriteText("-", text);
+}
+
+absl::Status Doctor(const CommandLine& line, const StopFlag& stop) {
+  const std::vector<Finding> findings =
+      Examine({.coordinator = line.coordinator,
+               .tls = line.tls,
+               .token_file = line.token_file,
+               .role = line.doctor_role,
+               .scene = line.scene,
+               .points = line.points,
+               .store = line.store,
+               .listen = line.listen,
+               .cache = line.cache,
+               .blob_directory = line.blob_dir},
+              [&](const ChannelSecurity& security) {
+                return MakeGrpcFarmLink(line.coordinator, stop, security);
+              });
+  if (!line.json.empty()) FP_RETURN_IF_ERROR(WriteText(line.json, FindingsJson(findings)));
+  // A stdout that carries JSON carries nothing else.
+  if (line.json != "-") FP_RETURN_IF_ERROR(WriteText("-", FindingsText(findings)));
+  return OutcomeOf(findings);
+}
+
+absl::Status AskFarm(const CommandLine& line, const StopFlag& stop, Console& console,
+                     bool& usage_error) {
   FP_RETURN_IF_ERROR(CheckOutputs(line));
-  const std::unique_ptr<FarmLink> farm = MakeGrpcFarmLink(line.coordinator, stop);
+  FP_ASSIGN_OR_RETURN(const std::unique_ptr<FarmLink> farm,
+                      OpenFarm(line, stop, console, usage_error));
   Retry retry = MakeRetry(line, stop, console);
   const FarmSession session{line, *farm, retry, stop, console};
   switch (line.verb) {
@@ -315,8 +427,14 @@ int RunCommand(const CommandLine& line, const StopFlag& stop, Console& console) 
     case Verb::kCompare:
       status = Compare(line, console);
       break;
+    case Verb::kCerts:
+      status = Certs(line, usage_error);
+      break;
+    case Verb::kDoctor:
+      status = Doctor(line, stop);
+      break;
     default:
-      status = AskFarm(line, stop, console);
+      status = AskFarm(line, stop, console, usage_error);
       break;
   }
   if (status.ok()) return kExitOk;

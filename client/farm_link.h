@@ -49,6 +49,11 @@ class FarmLink {
   virtual absl::Status Watch(const JobId& job, uint64_t after_sequence,
                              const std::function<absl::Status(const JobEvent&)>& on_event) = 0;
 
+  // kUnimplemented: a coordinator before this question, or one within the process.
+  virtual absl::StatusOr<CoordinatorHealth> Diagnose() {
+    return absl::UnimplementedError("this coordinator cannot be asked how it is");
+  }
+
   virtual absl::StatusOr<JobInfo> Info(const JobId& job) = 0;
 
   // Calls `on_tile` with each of `tiles`, in any order. The bytes' hashes are not checked here. An

@@ -13,6 +13,7 @@
 
 #include "proto/convert.h"
 #include "proto/farpoint.grpc.pb.h"
+#include "proto/grpc_channel.h"
 #include "proto/grpc_status.h"
 
 namespace farpoint {
@@ -22,6 +23,7 @@ using std::chrono::milliseconds;
 using std::chrono::seconds;
 
 constexpr seconds kControlDeadline(20);
+constexpr seconds kDiagnoseDeadline(5);
 constexpr seconds kInfoDeadline(60);
 // A watch is renewed after so long; it then goes on where it was.
 constexpr seconds kWatchDeadline(600);
@@ -29,20 +31,6 @@ constexpr seconds kWatchDeadline(600);
 constexpr seconds kBulkDeadline(60);
 constexpr size_t kSlowestBytesPerSecond = size_t{256} << 10;
 constexpr uint64_t kMaxTileBytes = uint64_t{1} << 32;
-constexpr int kMaxMessageBytes = 128 << 20;  // what is known of the tiles and frames of a job
-
-grpc::ChannelArguments ChannelArguments() {
-  grpc::ChannelArguments arguments;
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 2000);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 1000);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
-  arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
-  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
-  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 100);
-  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
-  arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
-  return arguments;
-}
 
 // What the library writes to stderr on its own says nothing that a call's status does not say, and
 // would stand in front of our error's one line. Who asks for it by GRPC_VERBOSITY gets it.
@@ -94,10 +82,11 @@ class Call {
 
 class GrpcFarmLink final : public FarmLink {
  public:
-  GrpcFarmLink(const std::string& address, const StopFlag& stop)
+  GrpcFarmLink(const std::string& address, const StopFlag& stop, const ChannelSecurity& security)
       : stop_(stop),
-        channel_(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(),
-                                           ChannelArguments())),
+        address_(address),
+        security_(security),
+        channel_(OpenChannel(address, security)),
         jobs_(v1::JobService::NewStub(channel_)),
         blobs_(v1::BlobService::NewStub(channel_)) {}
 
@@ -106,7 +95,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::FindMissingRequest request;
     for (const Digest& digest : blobs) request.add_sha256(ToWire(digest));
     v1::FindMissingResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(blobs_->FindMissing(call.context(), request, &response)));
+    FP_RETURN_IF_ERROR(Outcome(blobs_->FindMissing(call.context(), request, &response)));
     std::vector<Digest> missing;
     for (const std::string& hex : response.sha256()) {
       FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(hex, "sha256"));
@@ -133,17 +122,18 @@ class GrpcFarmLink final : public FarmLink {
       chunk.clear_size_bytes();
     } while (at < blob.size());
     writer->WritesDone();
-    return FromGrpc(writer->Finish());
+    return Outcome(writer->Finish());
   }
 
   absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) override {
     Call call(kControlDeadline, stop_);
     v1::SubmitRequest request;
     request.set_protocol_version(kProtocolVersion);
+    request.set_oldest_protocol_version(kOldestProtocolVersion);
     *request.mutable_job() = ToWire(spec);
     request.set_submission_id(submission_id);
     v1::SubmitResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Submit(call.context(), request, &response)));
+    FP_RETURN_IF_ERROR(Outcome(jobs_->Submit(call.context(), request, &response)));
     return JobId{response.job_id()};
   }
 
@@ -152,7 +142,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::StatusRequest request;
     request.set_job_id(job.value);
     v1::StatusResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Status(call.context(), request, &response)));
+    FP_RETURN_IF_ERROR(Outcome(jobs_->Status(call.context(), request, &response)));
     FarmStatus status;
     for (const v1::JobStatus& wire : response.jobs()) {
       FP_ASSIGN_OR_RETURN(JobStatus one, JobStatusFromWire(wire));
@@ -165,12 +155,19 @@ class GrpcFarmLink final : public FarmLink {
     return status;
   }
 
+  absl::StatusOr<CoordinatorHealth> Diagnose() override {
+    Call call(kDiagnoseDeadline, stop_);
+    v1::DiagnoseResponse response;
+    FP_RETURN_IF_ERROR(Outcome(jobs_->Diagnose(call.context(), {}, &response)));
+    return HealthFromWire(response);
+  }
+
   absl::Status Cancel(const JobId& job) override {
     Call call(kControlDeadline, stop_);
     v1::CancelRequest request;
     request.set_job_id(job.value);
     v1::CancelResponse response;
-    return FromGrpc(jobs_->Cancel(call.context(), request, &response));
+    return Outcome(jobs_->Cancel(call.context(), request, &response));
   }
 
   absl::Status Pause(const JobId& job) override {
@@ -178,7 +175,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::PauseRequest request;
     request.set_job_id(job.value);
     v1::PauseResponse response;
-    return FromGrpc(jobs_->Pause(call.context(), request, &response));
+    return Outcome(jobs_->Pause(call.context(), request, &response));
   }
 
   absl::Status Resume(const JobId& job) override {
@@ -186,7 +183,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::ResumeRequest request;
     request.set_job_id(job.value);
     v1::ResumeResponse response;
-    return FromGrpc(jobs_->Resume(call.context(), request, &response));
+    return Outcome(jobs_->Resume(call.context(), request, &response));
   }
 
   absl::Status SetPriority(const JobId& job, int32_t priority) override {
@@ -195,7 +192,7 @@ class GrpcFarmLink final : public FarmLink {
     request.set_job_id(job.value);
     request.set_priority(priority);
     v1::SetPriorityResponse response;
-    return FromGrpc(jobs_->SetPriority(call.context(), request, &response));
+    return Outcome(jobs_->SetPriority(call.context(), request, &response));
   }
 
   absl::Status Requeue(const JobId& job, bool all) override {
@@ -204,7 +201,7 @@ class GrpcFarmLink final : public FarmLink {
     request.set_job_id(job.value);
     request.set_all(all);
     v1::RequeueResponse response;
-    return FromGrpc(jobs_->Requeue(call.context(), request, &response));
+    return Outcome(jobs_->Requeue(call.context(), request, &response));
   }
 
   absl::StatusOr<Explanation> Explain(const JobId& job) override {
@@ -212,7 +209,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::ExplainRequest request;
     request.set_job_id(job.value);
     v1::ExplainResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->Explain(call.context(), request, &response)));
+    FP_RETURN_IF_ERROR(Outcome(jobs_->Explain(call.context(), request, &response)));
     return Explanation{{response.lines().begin(), response.lines().end()}};
   }
 
@@ -237,7 +234,7 @@ class GrpcFarmLink final : public FarmLink {
         return status;
       }
     }
-    return FromGrpc(reader->Finish());
+    return Outcome(reader->Finish());
   }
 
   absl::StatusOr<JobInfo> Info(const JobId& job) override {
@@ -245,7 +242,7 @@ class GrpcFarmLink final : public FarmLink {
     v1::FetchInfoRequest request;
     request.set_job_id(job.value);
     v1::FetchInfoResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(jobs_->FetchInfo(call.context(), request, &response)));
+    FP_RETURN_IF_ERROR(Outcome(jobs_->FetchInfo(call.context(), request, &response)));
     return JobInfoFromWire(response);
   }
 
@@ -265,7 +262,7 @@ class GrpcFarmLink final : public FarmLink {
       reader->Finish().ok();
       return read;
     }
-    return FromGrpc(reader->Finish());
+    return Outcome(reader->Finish());
   }
 
  private:
@@ -307,7 +304,20 @@ class GrpcFarmLink final : public FarmLink {
     return absl::OkStatus();
   }
 
+  // Of a call. While it is not known that the coordinator can be reached, with what keeps it from
+  // it.
+  absl::Status Outcome(const grpc::Status& grpc_status) {
+    const absl::Status status = FromGrpc(grpc_status);
+    if (reached_ || stop_.raised()) return status;
+    if (absl::IsUnavailable(status)) return ExplainFailure(status, address_, security_);
+    reached_ = !absl::IsDeadlineExceeded(status) && !absl::IsCancelled(status);
+    return status;
+  }
+
   const StopFlag& stop_;
+  const std::string address_;
+  const ChannelSecurity security_;
+  bool reached_ = false;
   std::shared_ptr<grpc::Channel> channel_;
   std::unique_ptr<v1::JobService::Stub> jobs_;
   std::unique_ptr<v1::BlobService::Stub> blobs_;
@@ -315,9 +325,10 @@ class GrpcFarmLink final : public FarmLink {
 
 }  // namespace
 
-std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop) {
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop,
+                                           const ChannelSecurity& security) {
   SilenceLibrary();
-  return std::make_unique<GrpcFarmLink>(address, stop);
+  return std::make_unique<GrpcFarmLink>(address, stop, security);
 }
 
 }  // namespace farpoint

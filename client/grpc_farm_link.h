@@ -7,10 +7,14 @@
 
 #include "client/farm_link.h"
 #include "client/stop_flag.h"
+#include "proto/connection_probe.h"
 
 namespace farpoint {
 
-// `address` is HOST:PORT. `stop` must outlive the link.
-std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop);
+// `address` is HOST:PORT. `stop` must outlive the link. Until the coordinator has answered once, a
+// connection that fails is looked into (proto/connection_probe.h), so that the error says what is
+// wrong.
+std::unique_ptr<FarmLink> MakeGrpcFarmLink(const std::string& address, const StopFlag& stop,
+                                           const ChannelSecurity& security = {});
 
 }  // namespace farpoint

@@ -27,6 +27,8 @@ int main(int argc, char** argv) {
     std::fputs(line->print->c_str(), stdout);
     return std::fflush(stdout) == 0 ? kExitOk : kExitTryAgain;
   }
+  const char* certs = std::getenv("FARPOINT_CERTS");
+  if (certs != nullptr && line->tls.empty() && !line->tls.insecure) line->tls.directory = certs;
   Console console(stderr, terminal, line->log_level, line->quiet);
   try {
     return RunCommand(*line, ProcessStopFlag(), console);
