@@ -32,6 +32,20 @@ float ReachOf(int spacing) {
   return std::max(kLeastScreenReach, kScreenReach * static_cast<float>(spacing));
 }
 int FloorDiv(int a, int b) { return a >= 0 ? a / b : -((b - 1 - a) / b); }
+int PixelOf(float at) { return static_cast<int>(std::floor(at)); }
+
+// Indices 0 … count - 1 by bin, ascending within one: those of bin b are order[first[b]] …
+// order[first[b + 1] - 1].
+template <typename BinOf>
+void CountingSort(size_t count, size_t bins, const BinOf& bin_of, std::vector<uint32_t>& first,
+                  std::vector<uint32_t>& order) {
+  first.assign(bins + 1, 0);
+  for (size_t i = 0; i < count; ++i) ++first[bin_of(i) + 1];
+  for (size_t b = 0; b < bins; ++b) first[b + 1] += first[b];
+  order.resize(count);
+  std::vector<uint32_t> at(first.begin(), first.end() - 1);
+  for (size_t i = 0; i < count; ++i) order[at[bin_of(i)]++] = static_cast<uint32_t>(i);
+}
 
 struct alignas(32) Lanes {
   float x[8], y[8], z[8], nx[8], ny[8], nz[8], px[8], py[8];
@@ -183,10 +197,155 @@ ReceiverHierarchy::ReceiverHierarchy(const HierarchyParams& params, const PixelR
   }
 }
 
+// One call of Prepare.
+struct ReceiverHierarchy::Pass {
+  const ReceiverHierarchy& hierarchy;
+  Executor& executor;
+  const std::function<bool(double)>& go_on;
+  Counts& counts;
+  View view;
+  // What the centres of the pixels of a rectangle show, row by row; footprint_m < 0: background.
+  PixelRect pixels_rect;
+  std::vector<ReceiverPlace> pixels;
+
+  struct Made {
+    ReceiverPlace place;
+    WorldCell cell;
+    std::shared_ptr<const ScreenRecord> record;
+  };
+
+  bool Cells(size_t l, const PixelRect& region);
+  bool Pixels(size_t l, const PixelRect& region);
+
+  ReceiverPlace PlaceAt(int x, int y) const {
+    ReceiverPlace place;
+    if (hierarchy.source_.ReceiverAt(x, y, place.receiver, place.footprint_m)) {
+      place.x_px = static_cast<float>(x) + 0.5f;
+      place.y_px = static_cast<float>(y) + 0.5f;
+    } else {
+      place.footprint_m = -1;
+    }
+    return place;
+  }
+  // From now on pixels.rect holds at least `rect`, which shrinks from level to level.
+  void LookAt(const PixelRect& rect) {
+    if (rect.empty() || pixels_rect.Intersect(rect) == rect) return;
+    pixels_rect = rect;
+    pixels.resize(static_cast<size_t>(rect.area()));
+    const size_t width = static_cast<size_t>(rect.width());
+    executor.ForEachPiece(pixels.size(), 64, [&](size_t begin, size_t end) {
+      for (size_t i = begin; i < end; ++i) {
+        pixels[i] =
+            PlaceAt(rect.x0 + static_cast<int>(i % width), rect.y0 + static_cast<int>(i / width));
+      }
+    });
+  }
+  const ReceiverPlace& Pixel(int x, int y) const {
+    return pixels[static_cast<size_t>(y - pixels_rect.y0) *
+                      static_cast<size_t>(pixels_rect.width()) +
+                  static_cast<size_t>(x - pixels_rect.x0)];
+  }
+
+  // Which of up to eight places are served too badly by `near`, as bits.
+  unsigned ServedBadly(std::span<const ScreenRecord* const> near,
+                       std::span<const ReceiverPlace* const> places) const {
+    const HierarchyParams& params = hierarchy.params_;
+    const size_t count = places.size();
+    ServedReceiver served[8];
+    for (size_t i = 0; i < count; ++i) {
+      served[i] = {&places[i]->receiver, places[i]->x_px, places[i]->y_px};
+    }
+    Rgb irradiance[8];
+    float weight[8], openness[8];
+    BlendSpread spread[8];
+    BlendRecords(near, {served, count}, {irradiance, count}, {weight, count}, {spread, count}, {},
+                 {openness, params.spread_open > 0 ? count : 0});
+    const auto above = [](float value, float most) { return most > 0 && value > most; };
+    unsigned badly = 0;
+    for (size_t i = 0; i < count; ++i) {
+      if (!(weight[i] >= params.enough) || above(spread[i].irradiance, params.spread_wm2) ||
+          above(spread[i].openness, params.spread_open)) {
+        badly |= 1u << i;
+      }
+    }
+    return badly;
+  }
+
+  // Gathers the records of level l; false: stopped.
+  bool Make(size_t l, std::span<Made> made) {
+    const Level& level = *hierarchy.levels_[l];
+    std::atomic<bool> stopped{false};
+    std::atomic<size_t> done{0};
+    executor.ForEach(made.size(), 1, [&](size_t i) {
+      if (stopped.load(std::memory_order_relaxed)) return;
+      const ReceiverPlace& place = made[i].place;
+      // By coarser neighbours.
+      float most_reach_m = std::numeric_limits<float>::infinity();
+      std::vector<const ScreenRecord*> near;
+      const int x = PixelOf(place.x_px), y = PixelOf(place.y_px);
+      view.Collect({x, y, x + 1, y + 1}, near);
+      for (const ScreenRecord* r : near) {
+        most_reach_m = std::min(
+            most_reach_m, r->gather.reach_m + Length(r->gather.position - place.receiver.position));
+      }
+      auto record = std::make_shared<ScreenRecord>();
+      record->x_px = place.x_px;
+      record->y_px = place.y_px;
+      record->screen_reach_px = ReachOf(level.spacing);
+      const uint64_t seed = hierarchy.params_.seed;
+      record->gather = hierarchy.source_.Gather(
+          place.receiver, level.grid,
+          HashKey(HashOf(made[i].cell, seed), kKeyGather, static_cast<uint64_t>(l)));
+      hierarchy.SetReach(place.footprint_m, most_reach_m, *record);
+      made[i].record = std::move(record);
+      const double part = static_cast<double>(++done) / static_cast<double>(made.size());
+      if (go_on &&
+          !go_on((static_cast<double>(l) + part) / static_cast<double>(hierarchy.levels_.size()))) {
+        stopped = true;
+      }
+    });
+    counts.records += made.size();
+    counts.samples += made.size() * uint64_t{level.grid.size()};
+    return !stopped;
+  }
+
+  // Adds a level's records to the view, in bins; within a bin in the order of their cells.
+  struct Kept {
+    WorldCell cell;
+    std::shared_ptr<const ScreenRecord> record;
+  };
+  void Show(const Level& level, const PixelRect& region, std::vector<Kept> kept) {
+    const int s = level.spacing;
+    View::Grid grid;
+    grid.spacing = s;
+    grid.x0 = FloorDiv(region.x0, s);
+    grid.y0 = FloorDiv(region.y0, s);
+    grid.columns = FloorDiv(region.x1 - 1, s) - grid.x0 + 1;
+    grid.rows = FloorDiv(region.y1 - 1, s) - grid.y0 + 1;
+    const auto bin_of = [&](const Kept& k) {
+      const int x = FloorDiv(PixelOf(k.record->x_px), s) - grid.x0;
+      const int y = FloorDiv(PixelOf(k.record->y_px), s) - grid.y0;
+      return static_cast<size_t>(y) * static_cast<size_t>(grid.columns) + static_cast<size_t>(x);
+    };
+    const size_t bins = static_cast<size_t>(grid.columns) * static_cast<size_t>(grid.rows);
+    std::vector<uint32_t> order;
+    CountingSort(
+        kept.size(), bins, [&](size_t i) { return bin_of(kept[i]); }, grid.first, order);
+    for (size_t bin = 0; bin < bins; ++bin) {
+      if (grid.first[bin + 1] - grid.first[bin] < 2) continue;
+      std::sort(order.begin() + grid.first[bin], order.begin() + grid.first[bin + 1],
+                [&](uint32_t i, uint32_t j) { return kept[i].cell < kept[j].cell; });
+    }
+    grid.records.reserve(kept.size());
+    for (const uint32_t i : order) grid.records.push_back(std::move(kept[i].record));
+    view.grids_.push_back(std::move(grid));
+  }
+};
+
 std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     const PixelRect& rect, Executor& executor, const std::function<bool(double)>& go_on,
     Counts& counts) const {
-  auto view = std::make_shared<View>();
+  Pass pass{*this, executor, go_on, counts, {}, {}, {}};
   // How far beyond `rect` records matter: their own influence, and that of all finer levels, whose
   // records depend on them.
   std::vector<int> margin(levels_.size());
@@ -195,272 +354,311 @@ std::shared_ptr<const ReceiverHierarchy::View> ReceiverHierarchy::Prepare(
     sum += ReachOf(levels_[l]->spacing);
     margin[l] = static_cast<int>(sum) + 1;
   }
-  // Every pixel is a candidate on the last levels.
-  struct PixelReceivers {
-    PixelRect rect;
-    std::vector<ReceiverPlace> places;  // row by row; footprint_m < 0: background
-  } pixels;
-  const auto pixel_receiver = [&](int x, int y, ReceiverPlace& place) {
-    if (pixels.rect.Contains(x, y)) {
-      place = pixels.places[static_cast<size_t>(y - pixels.rect.y0) *
-                                static_cast<size_t>(pixels.rect.width()) +
-                            static_cast<size_t>(x - pixels.rect.x0)];
-      return place.footprint_m >= 0;
-    }
-    return source_.ReceiverAt(x, y, place.receiver, place.footprint_m);
-  };
   for (size_t l = 0; l < levels_.size(); ++l) {
-    Level& level = *levels_[l];
-    const int s = level.spacing;
     const PixelRect region = Grown(rect, margin[l]);
-    const auto in_region = [&](float x, float y) {
-      return x >= static_cast<float>(region.x0) && x < static_cast<float>(region.x1) &&
-             y >= static_cast<float>(region.y0) && y < static_cast<float>(region.y1);
-    };
+    if (!(levels_[l]->anchored ? pass.Cells(l, region) : pass.Pixels(l, region))) return nullptr;
+  }
+  return std::make_shared<View>(std::move(pass.view));
+}
 
-    // The cells that candidates lie in, and who proposes them.
-    struct Item {
-      WorldCell cell;
-      ReceiverPlace place;  // of the candidate first, of the cell's own place then
-      bool known = false, wanted = false, chosen = false, decided = false;
-      uint32_t first = 0, end = 0;  // its proposers
-      std::shared_ptr<const ScreenRecord> record;
-    };
-    const int c = level.anchored ? std::max(1, s / 2) : 1;  // spacing of candidates
-    const int shift = level.anchored ? static_cast<int>(kMostShift * static_cast<float>(s)) + 1 : 0;
-    const PixelRect asked = Grown(region, shift).Intersect(frame_);
-    const int x0 = asked.x0 / c, y0 = asked.y0 / c;
-    const int columns = (asked.x1 - 1) / c - x0 + 1, rows = (asked.y1 - 1) / c - y0 + 1;
-    struct Candidate {
-      WorldCell cell;
-      ReceiverPlace place;
-      bool seen = false;
-    };
-    std::vector<Candidate> candidates(static_cast<size_t>(columns) * static_cast<size_t>(rows));
-    // The first of the levels that look at every pixel looks at the largest part of the frame.
-    const bool keep = c == 1 && pixels.places.empty();
-    std::vector<ReceiverPlace> kept_pixels(keep ? candidates.size() : 0);
-    executor.ForEachPiece(candidates.size(), 64, [&](size_t begin, size_t end) {
-      for (size_t i = begin; i < end; ++i) {
+bool ReceiverHierarchy::Pass::Cells(size_t l, const PixelRect& region) {
+  Level& level = *hierarchy.levels_[l];
+  const uint64_t seed = hierarchy.params_.seed;
+  const int s = level.spacing;
+  const auto in_region = [&](float x, float y) {
+    return x >= static_cast<float>(region.x0) && x < static_cast<float>(region.x1) &&
+           y >= static_cast<float>(region.y0) && y < static_cast<float>(region.y1);
+  };
+
+  // Candidates: what they show and the cells that they lie in.
+  const int c = std::max(1, s / 2);  // their spacing
+  const int shift = static_cast<int>(kMostShift * static_cast<float>(s)) + 1;
+  const PixelRect asked = Grown(region, shift).Intersect(hierarchy.frame_);
+  if (asked.empty()) {
+    Show(level, region, {});
+    return true;
+  }
+  const int x0 = asked.x0 / c, y0 = asked.y0 / c;
+  const int columns = (asked.x1 - 1) / c - x0 + 1, rows = (asked.y1 - 1) / c - y0 + 1;
+  const size_t count = static_cast<size_t>(columns) * static_cast<size_t>(rows);
+  counts.candidates += count;
+  if (c == 1) LookAt(asked);
+  std::vector<ReceiverPlace> own_places(c == 1 ? 0 : count);
+  const auto place_of = [&](size_t i) -> const ReceiverPlace& {
+    return c == 1 ? Pixel(x0 + static_cast<int>(i % static_cast<size_t>(columns)),
+                          y0 + static_cast<int>(i / static_cast<size_t>(columns)))
+                  : own_places[i];
+  };
+  std::vector<WorldCell> cells(count);
+  executor.ForEachPiece(count, 64, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) {
+      if (c > 1) {
         const uint64_t column = static_cast<uint64_t>(x0) + i % static_cast<size_t>(columns);
         const uint64_t row = static_cast<uint64_t>(y0) + i / static_cast<size_t>(columns);
         const uint64_t side = static_cast<uint64_t>(c);
-        const uint64_t jitter = HashKey(params_.seed, kKeyJitter, row << 32 | column, side);
+        const uint64_t jitter = HashKey(seed, kKeyJitter, row << 32 | column, side);
         const int x = static_cast<int>(column * side + jitter % side);
         const int y = static_cast<int>(row * side + (jitter >> 32) % side);
-        if (!frame_.Contains(x, y)) continue;
-        Candidate& candidate = candidates[i];
-        ReceiverPlace& place = candidate.place;
-        const bool hit = pixel_receiver(x, y, place);
-        if (keep) {
-          ReceiverPlace& kept = kept_pixels[i];
-          if (hit) {
-            kept = place;
-          } else {
-            kept.footprint_m = -1;
-          }
-        }
-        if (!hit) continue;
-        place.x_px = static_cast<float>(x) + 0.5f;
-        place.y_px = static_cast<float>(y) + 0.5f;
-        candidate.seen = true;
-        if (level.anchored) {
-          candidate.cell = CellOf(
-              place.receiver, kCellSide * static_cast<float>(s) * place.footprint_m, params_.seed);
+        if (hierarchy.frame_.Contains(x, y)) {
+          own_places[i] = PlaceAt(x, y);
         } else {
-          candidate.cell.i = x;
-          candidate.cell.j = y;
+          own_places[i].footprint_m = -1;
         }
       }
-    });
-    counts.candidates += candidates.size();
-    if (keep) pixels = {asked, std::move(kept_pixels)};
-    std::erase_if(candidates, [](const Candidate& candidate) { return !candidate.seen; });
-    std::stable_sort(candidates.begin(), candidates.end(),
-                     [](const Candidate& a, const Candidate& b) { return a.cell < b.cell; });
-    std::vector<Item> items;
-    for (uint32_t i = 0; i < candidates.size(); ++i) {
-      if (i == 0 || !(candidates[i].cell == candidates[i - 1].cell)) {
-        Item& item = items.emplace_back();
-        item.cell = candidates[i].cell;
-        item.place = candidates[i].place;
-        item.first = i;
-      }
-      items.back().end = i + 1;
+      const ReceiverPlace& place = place_of(i);
+      if (place.footprint_m < 0) continue;
+      cells[i] =
+          CellOf(place.receiver, kCellSide * static_cast<float>(s) * place.footprint_m, seed);
     }
-    {
-      const std::lock_guard lock(level.mutex);
-      for (Item& item : items) {
-        const auto it = level.records.find(item.cell);
-        if (it == level.records.end()) continue;
-        item.known = true;
-        item.record = it->second;
-      }
-    }
+  });
 
-    // Whose place counts …
-    executor.ForEachPiece(items.size(), 16, [&](size_t begin, size_t end) {
-      for (size_t i = begin; i < end; ++i) {
-        Item& item = items[i];
-        ReceiverPlace& place = item.place;
-        if (item.known) {
-          if (!item.record) continue;
-          place.x_px = item.record->x_px;
-          place.y_px = item.record->y_px;
-        } else if (level.anchored &&
-                   !source_.ReceiverAlong(ProbeOf(item.cell, params_.seed), place)) {
-          item.decided = true;
+  // The cells, each once, and who proposes them.
+  struct Item {
+    WorldCell cell;
+    ReceiverPlace place;  // of the cell
+    bool known = false, wanted = false, chosen = false, decided = false;
+    std::shared_ptr<const ScreenRecord> record;
+  };
+  std::vector<Item> items;
+  constexpr uint32_t kNobody = ~uint32_t{0};
+  std::vector<uint32_t> item_of(count, kNobody);
+  {
+    size_t size = 16;
+    while (size < 2 * count) size *= 2;
+    std::vector<uint32_t> table(size, kNobody);
+    for (size_t i = 0; i < count; ++i) {
+      if (place_of(i).footprint_m < 0) continue;
+      if (i > 0 && item_of[i - 1] != kNobody && cells[i] == cells[i - 1]) {
+        item_of[i] = item_of[i - 1];
+        continue;
+      }
+      size_t at = (WorldCellHash()(cells[i]) + static_cast<size_t>(cells[i].exponent)) & (size - 1);
+      while (table[at] != kNobody && !(items[table[at]].cell == cells[i])) {
+        at = (at + 1) & (size - 1);
+      }
+      if (table[at] == kNobody) {
+        table[at] = static_cast<uint32_t>(items.size());
+        items.emplace_back().cell = cells[i];
+      }
+      item_of[i] = table[at];
+    }
+  }
+  std::vector<uint32_t> first_proposer, proposers;
+  CountingSort(
+      count, items.size() + 1,
+      [&](size_t i) { return item_of[i] == kNobody ? items.size() : size_t{item_of[i]}; },
+      first_proposer, proposers);
+  {
+    const std::lock_guard lock(level.mutex);
+    for (Item& item : items) {
+      if (level.records.empty()) break;
+      const auto it = level.records.find(item.cell);
+      if (it == level.records.end()) continue;
+      item.known = true;
+      item.record = it->second;
+    }
+  }
+
+  // Whose place counts …
+  executor.ForEachPiece(items.size(), 16, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) {
+      Item& item = items[i];
+      ReceiverPlace& place = item.place;
+      if (item.known) {
+        if (!item.record) continue;
+        place.x_px = item.record->x_px;
+        place.y_px = item.record->y_px;
+      } else if (!hierarchy.source_.ReceiverAlong(ProbeOf(item.cell, seed), place)) {
+        item.decided = true;
+        continue;
+      }
+      if (!in_region(place.x_px, place.y_px)) continue;
+      const float most = kMostShift * static_cast<float>(s);
+      item.wanted = std::any_of(proposers.begin() + first_proposer[i],
+                                proposers.begin() + first_proposer[i + 1], [&](uint32_t by) {
+                                  const ReceiverPlace& from = place_of(by);
+                                  const float dx = from.x_px - place.x_px,
+                                              dy = from.y_px - place.y_px;
+                                  return dx * dx + dy * dy <= most * most;
+                                });
+      item.chosen = item.wanted && !item.known && l == 0;
+    }
+  });
+
+  // … and is served too badly …
+  std::vector<uint32_t> doubtful;
+  for (uint32_t i = 0; i < items.size() && l > 0; ++i) {
+    if (items[i].wanted && !items[i].known) doubtful.push_back(i);
+  }
+  const int across = (region.width() + kSquare - 1) / kSquare;
+  const int down = (region.height() + kSquare - 1) / kSquare;
+  std::vector<uint32_t> first, by_square;
+  CountingSort(
+      doubtful.size(), static_cast<size_t>(across) * static_cast<size_t>(down),
+      [&](size_t i) {
+        const ReceiverPlace& place = items[doubtful[i]].place;
+        const int column = (PixelOf(place.x_px) - region.x0) / kSquare;
+        const int row = (PixelOf(place.y_px) - region.y0) / kSquare;
+        return static_cast<size_t>(row) * static_cast<size_t>(across) + static_cast<size_t>(column);
+      },
+      first, by_square);
+  executor.ForEachPiece(first.size() - 1, 1, [&](size_t begin, size_t end) {
+    std::vector<const ScreenRecord*> near;
+    for (size_t q = begin; q < end; ++q) {
+      if (first[q] == first[q + 1]) continue;
+      near.clear();
+      const int x = region.x0 + kSquare * static_cast<int>(q % static_cast<size_t>(across));
+      const int y = region.y0 + kSquare * static_cast<int>(q / static_cast<size_t>(across));
+      view.Collect({x, y, x + kSquare, y + kSquare}, near);
+      for (uint32_t at = first[q]; at < first[q + 1]; at += 8) {
+        const size_t together = std::min<size_t>(8, first[q + 1] - at);
+        const ReceiverPlace* places[8];
+        for (size_t i = 0; i < together; ++i) places[i] = &items[doubtful[by_square[at + i]]].place;
+        const unsigned badly = ServedBadly(near, {places, together});
+        for (size_t i = 0; i < together; ++i) {
+          Item& item = items[doubtful[by_square[at + i]]];
+          item.chosen = (badly >> i & 1) != 0;
+          item.decided = !item.chosen;
+        }
+      }
+    }
+  });
+
+  // … gets a record.
+  std::vector<uint32_t> chosen;
+  for (uint32_t i = 0; i < items.size(); ++i) {
+    if (items[i].chosen) chosen.push_back(i);
+  }
+  std::vector<Made> made(chosen.size());
+  for (size_t i = 0; i < chosen.size(); ++i) {
+    made[i].place = items[chosen[i]].place;
+    made[i].cell = items[chosen[i]].cell;
+  }
+  if (!Make(l, made)) return false;
+  for (size_t i = 0; i < chosen.size(); ++i) items[chosen[i]].record = std::move(made[i].record);
+  {
+    const std::lock_guard lock(level.mutex);
+    if (level.records.size() + items.size() > kKeptRecords) level.records.clear();
+    for (const Item& item : items) {
+      if (item.chosen || item.decided) level.records.try_emplace(item.cell, item.record);
+    }
+  }
+  std::vector<Kept> kept;
+  for (Item& item : items) {
+    if (item.wanted && item.record) kept.push_back({item.cell, std::move(item.record)});
+  }
+  Show(level, region, std::move(kept));
+  return true;
+}
+
+bool ReceiverHierarchy::Pass::Pixels(size_t l, const PixelRect& region) {
+  Level& level = *hierarchy.levels_[l];
+  const PixelRect asked = region.Intersect(hierarchy.frame_);
+  if (asked.empty()) {
+    Show(level, region, {});
+    return true;
+  }
+  LookAt(asked);
+  counts.candidates += static_cast<uint64_t>(asked.area());
+  // By squares of the frame.
+  const int column0 = FloorDiv(asked.x0, kSquare), row0 = FloorDiv(asked.y0, kSquare);
+  const int across = FloorDiv(asked.x1 - 1, kSquare) - column0 + 1;
+  const int down = FloorDiv(asked.y1 - 1, kSquare) - row0 + 1;
+  const size_t squares = static_cast<size_t>(across) * static_cast<size_t>(down);
+  struct Square {
+    std::vector<std::shared_ptr<const ScreenRecord>> known;
+    std::vector<const ReceiverPlace*> chosen;
+  };
+  std::vector<Square> found(squares);
+  const auto key_of = [&](size_t q) {
+    return static_cast<uint64_t>(row0 + static_cast<int>(q / static_cast<size_t>(across))) << 32 |
+           static_cast<uint32_t>(column0 + static_cast<int>(q % static_cast<size_t>(across)));
+  };
+  {
+    const std::lock_guard lock(level.mutex);
+    for (size_t q = 0; q < squares && !level.squares.empty(); ++q) {
+      const auto it = level.squares.find(key_of(q));
+      if (it != level.squares.end()) found[q].known = it->second;
+    }
+  }
+  executor.ForEachPiece(squares, 1, [&](size_t begin, size_t end) {
+    std::vector<const ScreenRecord*> near;
+    for (size_t q = begin; q < end; ++q) {
+      Square& square = found[q];
+      const int x0 = kSquare * (column0 + static_cast<int>(q % static_cast<size_t>(across)));
+      const int y0 = kSquare * (row0 + static_cast<int>(q / static_cast<size_t>(across)));
+      const PixelRect rect = PixelRect{x0, y0, x0 + kSquare, y0 + kSquare}.Intersect(asked);
+      uint64_t done = 0;  // bits of the square's pixels
+      const auto bit_of = [&](int x, int y) {
+        return uint64_t{1} << (static_cast<unsigned>(y - y0) * kSquare +
+                               static_cast<unsigned>(x - x0));
+      };
+      std::erase_if(square.known, [&](const auto& record) {
+        return !rect.Contains(PixelOf(record->x_px), PixelOf(record->y_px));
+      });
+      for (const auto& record : square.known) {
+        done |= bit_of(PixelOf(record->x_px), PixelOf(record->y_px));
+      }
+      near.clear();
+      if (l > 0) view.Collect(rect, near);
+      const ReceiverPlace* places[8];
+      size_t together = 0;
+      const auto flush = [&] {
+        if (together == 0) return;
+        const unsigned badly = l == 0 ? ~0u : ServedBadly(near, {places, together});
+        for (size_t i = 0; i < together; ++i) {
+          if ((badly >> i & 1) != 0) square.chosen.push_back(places[i]);
+        }
+        together = 0;
+      };
+      for (int y = rect.y0; y < rect.y1; ++y) {
+        for (int x = rect.x0; x < rect.x1; ++x) {
+          const ReceiverPlace& place = Pixel(x, y);
+          if (place.footprint_m < 0 || (done & bit_of(x, y)) != 0) continue;
+          places[together++] = &place;
+          if (together == 8) flush();
+        }
+      }
+      flush();
+    }
+  });
+  std::vector<Made> made;
+  std::vector<Kept> kept;
+  for (Square& square : found) {
+    // A pixel's record has the key of its place, too.
+    for (const ReceiverPlace* place : square.chosen) {
+      made.push_back(
+          {*place, CellOf(place->receiver, place->footprint_m, hierarchy.params_.seed), nullptr});
+    }
+    for (auto& record : square.known) kept.push_back({{}, std::move(record)});
+  }
+  if (!Make(l, made)) return false;
+  {
+    const std::lock_guard lock(level.mutex);
+    if (level.kept + made.size() > kKeptRecords) {
+      level.squares.clear();
+      level.kept = 0;
+    }
+    size_t next = 0;
+    for (size_t q = 0; q < squares; ++q) {
+      if (found[q].chosen.empty()) continue;
+      auto& own = level.squares[key_of(q)];
+      for (size_t i = 0; i < found[q].chosen.size(); ++i, ++next) {
+        const auto& record = made[next].record;
+        // Another thread may have been faster.
+        if (std::any_of(own.begin(), own.end(), [&](const auto& other) {
+              return other->x_px == record->x_px && other->y_px == record->y_px;
+            })) {
           continue;
         }
-        if (!in_region(place.x_px, place.y_px)) continue;
-        if (level.anchored) {
-          const float most = kMostShift * static_cast<float>(s);
-          const bool close = std::any_of(candidates.begin() + item.first,
-                                         candidates.begin() + item.end, [&](const Candidate& by) {
-                                           const float dx = by.place.x_px - place.x_px,
-                                                       dy = by.place.y_px - place.y_px;
-                                           return dx * dx + dy * dy <= most * most;
-                                         });
-          if (!close) continue;
-        }
-        item.wanted = true;
-        item.chosen = !item.known && l == 0;
-      }
-    });
-
-    // … and is served too badly …
-    struct Doubtful {
-      uint64_t square;
-      uint32_t item;
-    };
-    std::vector<Doubtful> doubtful;
-    const auto pixel_of = [](float at) { return static_cast<int>(std::floor(at)); };
-    const auto square_of = [&](float at, int first) {
-      return static_cast<uint32_t>((pixel_of(at) - first) / kSquare);
-    };
-    for (uint32_t i = 0; i < items.size() && l > 0; ++i) {
-      const ReceiverPlace& place = items[i].place;
-      if (!items[i].wanted || items[i].known) continue;
-      doubtful.push_back(
-          {uint64_t{square_of(place.y_px, region.y0)} << 32 | square_of(place.x_px, region.x0), i});
-    }
-    std::sort(doubtful.begin(), doubtful.end(), [](const Doubtful& a, const Doubtful& b) {
-      return a.square != b.square ? a.square < b.square : a.item < b.item;
-    });
-    std::vector<uint32_t> squares;  // their first
-    for (uint32_t i = 0; i < doubtful.size(); ++i) {
-      if (i == 0 || doubtful[i].square != doubtful[i - 1].square) squares.push_back(i);
-    }
-    squares.push_back(static_cast<uint32_t>(doubtful.size()));
-    executor.ForEachPiece(squares.size() - 1, 1, [&](size_t begin, size_t end) {
-      std::vector<const ScreenRecord*> near;
-      for (size_t q = begin; q < end; ++q) {
-        near.clear();
-        const uint64_t square = doubtful[squares[q]].square;
-        const int x = region.x0 + kSquare * static_cast<int>(square & 0xffffffffu);
-        const int y = region.y0 + kSquare * static_cast<int>(square >> 32);
-        view->Collect({x, y, x + kSquare, y + kSquare}, near);
-        for (uint32_t at = squares[q]; at < squares[q + 1]; at += 8) {
-          const size_t count = std::min<size_t>(8, squares[q + 1] - at);
-          ServedReceiver served[8];
-          for (size_t i = 0; i < count; ++i) {
-            const ReceiverPlace& place = items[doubtful[at + i].item].place;
-            served[i] = {&place.receiver, place.x_px, place.y_px};
-          }
-          Rgb irradiance[8];
-          float weight[8], openness[8];
-          BlendSpread spread[8];
-          BlendRecords(near, {served, count}, {irradiance, count}, {weight, count}, {spread, count},
-                       {}, {openness, params_.spread_open > 0 ? count : 0});
-          const auto above = [](float value, float most) { return most > 0 && value > most; };
-          for (size_t i = 0; i < count; ++i) {
-            Item& item = items[doubtful[at + i].item];
-            item.chosen = !(weight[i] >= params_.enough) ||
-                          above(spread[i].irradiance, params_.spread_wm2) ||
-                          above(spread[i].openness, params_.spread_open);
-            item.decided = !item.chosen && level.anchored;
-          }
-        }
-      }
-    });
-
-    // … gets one.
-    std::vector<uint32_t> made;
-    for (uint32_t i = 0; i < items.size(); ++i) {
-      if (items[i].chosen) made.push_back(i);
-    }
-    std::atomic<bool> stopped{false};
-    std::atomic<size_t> done{0};
-    executor.ForEach(made.size(), 1, [&](size_t i) {
-      if (stopped.load(std::memory_order_relaxed)) return;
-      Item& item = items[made[i]];
-      // By coarser neighbours.
-      float most_reach_m = std::numeric_limits<float>::infinity();
-      std::vector<const ScreenRecord*> near;
-      const int x = pixel_of(item.place.x_px), y = pixel_of(item.place.y_px);
-      view->Collect({x, y, x + 1, y + 1}, near);
-      for (const ScreenRecord* r : near) {
-        most_reach_m =
-            std::min(most_reach_m,
-                     r->gather.reach_m + Length(r->gather.position - item.place.receiver.position));
-      }
-      auto record = std::make_shared<ScreenRecord>();
-      record->x_px = item.place.x_px;
-      record->y_px = item.place.y_px;
-      record->screen_reach_px = ReachOf(s);
-      GatherRecord& g = record->gather;
-      // A pixel's record has the key of its place, too.
-      const WorldCell cell =
-          level.anchored ? item.cell
-                         : CellOf(item.place.receiver, item.place.footprint_m, params_.seed);
-      g = source_.Gather(item.place.receiver, level.grid,
-                         HashKey(HashOf(cell, params_.seed), kKeyGather, static_cast<uint64_t>(l)));
-      SetReach(item.place.footprint_m, most_reach_m, *record);
-      item.record = std::move(record);
-      const double part = static_cast<double>(++done) / static_cast<double>(made.size());
-      if (go_on && !go_on((static_cast<double>(l) + part) / static_cast<double>(levels_.size()))) {
-        stopped = true;
-      }
-    });
-    if (stopped) return nullptr;
-    counts.records += made.size();
-    counts.samples += made.size() * uint64_t{level.grid.size()};
-    {
-      const std::lock_guard lock(level.mutex);
-      if (level.records.size() + items.size() > kKeptRecords) level.records.clear();
-      for (const Item& item : items) {
-        if (item.chosen || item.decided) level.records.try_emplace(item.cell, item.record);
+        own.push_back(record);
+        ++level.kept;
       }
     }
-
-    // In bins; within a bin in the order of the cells.
-    View::Grid grid;
-    grid.spacing = s;
-    grid.x0 = FloorDiv(region.x0, s);
-    grid.y0 = FloorDiv(region.y0, s);
-    grid.columns = FloorDiv(region.x1 - 1, s) - grid.x0 + 1;
-    grid.rows = FloorDiv(region.y1 - 1, s) - grid.y0 + 1;
-    const auto bin_of = [&](const ScreenRecord& r) {
-      const int x = FloorDiv(static_cast<int>(std::floor(r.x_px)), s) - grid.x0;
-      const int y = FloorDiv(static_cast<int>(std::floor(r.y_px)), s) - grid.y0;
-      return static_cast<size_t>(y) * static_cast<size_t>(grid.columns) + static_cast<size_t>(x);
-    };
-    grid.first.assign(static_cast<size_t>(grid.columns) * static_cast<size_t>(grid.rows) + 1, 0);
-    uint32_t records = 0;
-    for (const Item& item : items) {
-      if (!item.wanted || !item.record) continue;
-      ++grid.first[bin_of(*item.record) + 1];
-      ++records;
-    }
-    for (size_t i = 1; i < grid.first.size(); ++i) grid.first[i] += grid.first[i - 1];
-    grid.records.resize(records);
-    std::vector<uint32_t> at(grid.first.begin(), grid.first.end() - 1);
-    for (const Item& item : items) {
-      if (item.wanted && item.record) grid.records[at[bin_of(*item.record)]++] = item.record;
-    }
-    view->grids_.push_back(std::move(grid));
   }
-  return view;
+  for (Made& m : made) kept.push_back({{}, std::move(m.record)});
+  Show(level, region, std::move(kept));
+  return true;
 }
 
 ScreenRecord ReceiverHierarchy::MakeOwnRecord(const ServedReceiver& receiver, float footprint_m,

@@ -177,9 +177,13 @@ class ReceiverHierarchy {
     const bool anchored;  // to world cells; else to pixels
     const HemisphereGrid grid;
     std::mutex mutex;
-    // Null: none is needed. Of pixels only those that have one.
+    // Of cells, null: none is needed.
     std::unordered_map<WorldCell, std::shared_ptr<const ScreenRecord>, WorldCellHash> records;
+    // Of pixels, by squares of the frame: row << 32 | column.
+    std::unordered_map<uint64_t, std::vector<std::shared_ptr<const ScreenRecord>>> squares;
+    size_t kept = 0;  // in squares
   };
+  struct Pass;
 
   void SetReach(float footprint_m, float most_reach_m, ScreenRecord& record) const;
 
