@@ -237,6 +237,47 @@ bool RayAccel::Occluded(const Vec3f& origin, const Vec3f& direction, float t_max
   return ray.tfar < 0.0f;
 }
 
+unsigned RayAccel::Occluded8(std::span<const Vec3f, 8> origins,
+                             std::span<const Vec3f, 8> directions, std::span<const float, 8> t_max,
+                             unsigned mask, bool from_one_point) const {
+  const FpTrapPause pause;
+  alignas(32) int valid[8];
+  alignas(32) RTCRay8 rays;
+  for (size_t i = 0; i < 8; ++i) {
+    valid[i] = (mask >> i & 1) != 0 ? -1 : 0;
+    if (record_ != nullptr && valid[i] != 0) [[unlikely]]
+      record_->push_back({origins[i], directions[i], t_max[i], true});
+    rays.org_x[i] = origins[i].x;
+    rays.org_y[i] = origins[i].y;
+    rays.org_z[i] = origins[i].z;
+    rays.dir_x[i] = directions[i].x;
+    rays.dir_y[i] = directions[i].y;
+    rays.dir_z[i] = directions[i].z;
+    rays.tnear[i] = 0.0f;
+    rays.tfar[i] = t_max[i];
+    rays.time[i] = 0.0f;
+    rays.mask[i] = ~0u;
+    rays.id[i] = 0;
+    rays.flags[i] = 0;
+  }
+#if RTC_VERSION_MAJOR >= 4
+  RTCOccludedArguments arguments;
+  rtcInitOccludedArguments(&arguments);
+  if (from_one_point) arguments.flags = RTC_RAY_QUERY_FLAG_COHERENT;
+  rtcOccluded8(valid, impl_->scene, &rays, &arguments);
+#else
+  RTCIntersectContext context;
+  rtcInitIntersectContext(&context);
+  if (from_one_point) context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+  rtcOccluded8(valid, impl_->scene, &context, &rays);
+#endif
+  unsigned blocked = 0;
+  for (size_t i = 0; i < 8; ++i) {
+    if (valid[i] != 0 && rays.tfar[i] < 0.0f) blocked |= 1u << i;
+  }
+  return blocked;
+}
+
 size_t RayAccel::TraceBare(std::span<const TracedRay> rays) const {
   size_t hits = 0;
 #if RTC_VERSION_MAJOR < 4

@@ -1,7 +1,8 @@
 // Ray queries against the triangles of a prepared scene. The only user of Embree.
 //
 // Determinism: Embree runs with isa=avx2, and there is one kind of call for each purpose (one ray
-// at a time), so the same ray gives the same bits whatever the machine and the number of threads.
+// at a time, or eight of one caller), so the same query gives the same bits whatever the machine
+// and the number of threads.
 //
 // Watertight but for IntersectBundle: no ray passes between two triangles that share an edge (equal
 // end points). Of rays aimed exactly at a vertex of many triangles, fewer than one in a hundred
@@ -56,6 +57,11 @@ class RayAccel {
   // Whether anything lies at 0 <= t <= t_max.
   bool Occluded(const Vec3f& origin, const Vec3f& direction,
                 float t_max = std::numeric_limits<float>::infinity()) const;
+  // The same of the rays of a mask's bits, as bits. `from_one_point`: all origins are the same, and
+  // directions lie near each other: then a ray takes 0.6 of Occluded's time (shadow rays to the
+  // light of the Cornell box).
+  unsigned Occluded8(std::span<const Vec3f, 8> origins, std::span<const Vec3f, 8> directions,
+                     std::span<const float, 8> t_max, unsigned mask, bool from_one_point) const;
 
   // What a gather needs, many rays from one point: the nearest hit of each direction, `triangle`
   // kNoTriangle where there is none. Takes two thirds of Intersect's time (Sponza) and is not

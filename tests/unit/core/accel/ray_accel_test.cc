@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <string>
 #include <utility>
 #include <vector>
@@ -281,6 +282,14 @@ Escapes CountEscapes(const Scene& description, uint64_t seed) {
     const Vec3f origin = centre + (vertex - centre) * static_cast<float>(random.Uniform(0, 0.9));
     const bool hit = accel->Intersect(origin, target - origin).has_value();
     EXPECT_EQ(accel->Occluded(origin, target - origin), hit);
+    std::array<Vec3f, 8> origins, directions;
+    origins.fill(origin);
+    directions.fill(target - origin);
+    constexpr float kFar = std::numeric_limits<float>::infinity();
+    EXPECT_EQ(
+        accel->Occluded8(origins, directions,
+                         std::array{kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar}, 0xff, true),
+        hit ? 0xffu : 0u);
     return hit ? 0 : 1;
   };
   for (const PreparedTriangle& t : scene.triangles()) {
@@ -359,14 +368,53 @@ TEST(RayAccel, DistanceIsInUnitsOfTheDirectionAndBoundedByTMax) {
   EXPECT_FALSE(accel->Occluded({0.25f, 0.125f, 5}, {0, 0, 1}));
 }
 
-TEST(RayAccel, ABundleMeetsWhatItsRaysMeetAlone) {
-  // Half masked quads amid a soup, and something opaque before and after them in the order.
+// Half masked quads amid a soup, and something opaque before and after them in the order.
+Scene MaskedSoup() {
   Scene scene = MaskedLayers(3, false);
   Mesh soup = MakeSoup(3000, 0.15, 77).meshes[0];
   soup.material = 0;
   for (Vec3f& p : soup.positions) p.z += 1.5f;
   scene.instances.push_back({"soup", static_cast<uint32_t>(scene.meshes.size()), {}});
   scene.meshes.push_back(std::move(soup));
+  return scene;
+}
+
+TEST(RayAccel, EightRaysAreBlockedAsEachIsAlone) {
+  const auto accel = BuildAccel(MaskedSoup());
+  ASSERT_TRUE(accel->scene().has_alpha_masks());
+  TestRandom random(6);
+  constexpr int kGroups = 4000;
+  int blocked = 0, asked = 0, different = 0;
+  for (int i = 0; i < kGroups; ++i) {
+    const bool one_point = i % 2 == 0;
+    std::array<Vec3f, 8> origins, directions;
+    std::array<float, 8> t_max;
+    const Vec3d towards = random.Direction();
+    for (size_t k = 0; k < 8; ++k) {
+      origins[k] =
+          one_point && k > 0
+              ? origins[0]
+              : Vec3f(Vec3d(random.Uniform(-1, 1), random.Uniform(-1, 1), random.Uniform(-1, 1)));
+      directions[k] = Vec3f(Normalize(towards + 0.2 * random.Direction()));
+      t_max[k] = static_cast<float>(random.Uniform(0, 2));
+    }
+    const unsigned mask = static_cast<unsigned>(random.Index(256));
+    const unsigned got = accel->Occluded8(origins, directions, t_max, mask, one_point);
+    EXPECT_EQ(got & ~mask, 0u);
+    for (size_t k = 0; k < 8; ++k) {
+      if ((mask >> k & 1) == 0) continue;
+      ++asked;
+      blocked += static_cast<int>(got >> k & 1);
+      different += accel->Occluded(origins[k], directions[k], t_max[k]) != ((got >> k & 1) != 0);
+    }
+  }
+  EXPECT_GT(blocked, asked / 5);
+  EXPECT_LT(blocked, asked - asked / 5);
+  EXPECT_EQ(different, 0);
+}
+
+TEST(RayAccel, ABundleMeetsWhatItsRaysMeetAlone) {
+  const Scene scene = MaskedSoup();
   const auto accel = BuildAccel(scene);
   ASSERT_TRUE(accel->scene().has_alpha_masks());
   ASSERT_TRUE(accel->PrepareBundles().ok());
