@@ -91,6 +91,7 @@ StopSignals::StopSignals() {
   sigaddset(&signals_, SIGINT);
   ::pthread_sigmask(SIG_BLOCK, &signals_, nullptr);
   std::signal(SIGPIPE, SIG_IGN);
+  std::signal(SIGXFSZ, SIG_IGN);  // a file that may not grow is an error of the write
 }
 
 bool StopSignals::Wait(std::chrono::milliseconds timeout) const {

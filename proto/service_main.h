@@ -38,7 +38,7 @@ std::string LogText(const JobId& job, std::optional<uint32_t> tile, uint32_t att
                     const WorkerId& worker, std::string_view text);
 
 // SIGTERM and SIGINT, heard only by whoever waits. Construct before any thread starts, so that all
-// inherit it. SIGPIPE is ignored, too.
+// inherit it. SIGPIPE and SIGXFSZ are ignored, too.
 class StopSignals {
  public:
   StopSignals();

@@ -1,3 +1,9 @@
+#include <algorithm>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <vector>
+
 #include "proto/convert.h"
 #include "proto/farpoint.grpc.pb.h"
 #include "proto/grpc_status.h"
@@ -8,6 +14,31 @@ namespace farpoint {
 namespace {
 
 constexpr int kMaxAsked = 65536;
+constexpr size_t kRememberedBlobs = 64;
+
+// The hashes of a blob's chunks from its start, computed once for all who get it. Thread-safe.
+class ChunkHashes {
+ public:
+  using Hashes = std::vector<Digest>;
+  std::shared_ptr<const Hashes> Of(const Digest& name, std::span<const std::byte> bytes) {
+    std::lock_guard lock(mutex_);
+    auto at = known_.find(name);
+    if (at != known_.end()) return at->second;
+    // Held while it computes: who else wants this blob would only do the same.
+    auto hashes = std::make_shared<Hashes>();
+    for (size_t begin = 0; begin < bytes.size(); begin += kChunkBytes) {
+      hashes->push_back(
+          HashBytes(bytes.subspan(begin, std::min(kChunkBytes, bytes.size() - begin))));
+    }
+    if (known_.size() >= kRememberedBlobs) known_.erase(known_.begin());
+    known_.emplace(name, hashes);
+    return hashes;
+  }
+
+ private:
+  std::mutex mutex_;
+  std::map<Digest, std::shared_ptr<const Hashes>> known_;  // guarded by mutex_
+};
 
 class BlobServiceImpl final : public v1::BlobService::Service {
  public:
@@ -71,11 +102,17 @@ class BlobServiceImpl final : public v1::BlobService::Service {
                                      ", the blob has " + std::to_string(bytes.size()));
       }
       size_t at = static_cast<size_t>(request->offset_bytes());
+      const std::shared_ptr<const ChunkHashes::Hashes> hashes = chunk_hashes_.Of(digest, bytes);
       v1::GetBlobChunk chunk;
       chunk.set_size_bytes(bytes.size());
       do {
-        const size_t size = std::min(kChunkBytes, bytes.size() - at);
+        // To the next whole chunk first, so that the hashes fit from there on.
+        const size_t size = std::min(kChunkBytes - at % kChunkBytes, bytes.size() - at);
         chunk.set_data(bytes.data() + at, size);
+        const bool whole = at % kChunkBytes == 0 && size > 0;
+        const Digest hash =
+            whole ? (*hashes)[at / kChunkBytes] : HashBytes(bytes.subspan(at, size));
+        chunk.set_data_sha256(hash.bytes.data(), hash.bytes.size());
         at += size;
         // Blocks while the peer does not read: at most a few chunks are in memory.
         if (!stream->Write(chunk)) return absl::CancelledError("the peer is gone");
@@ -88,6 +125,7 @@ class BlobServiceImpl final : public v1::BlobService::Service {
  private:
   CoordinatorApi& coordinator_;
   const ServiceAccess& access_;
+  ChunkHashes chunk_hashes_;
 };
 
 }  // namespace

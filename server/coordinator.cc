@@ -34,6 +34,8 @@ constexpr std::chrono::milliseconds kMaxWait{30000};
 constexpr uint32_t kFramesAhead = 8;
 constexpr uint32_t kTilesAheadPerWorker = 4;
 constexpr size_t kSlowestTiles = 3;
+// So much of a job's tiles is hashed when the coordinator starts, so that it starts soon.
+constexpr uint64_t kReadAtRestart = uint64_t{128} << 20;
 constexpr uint32_t kProblems = 5;
 
 int64_t UnixMs() {
@@ -67,6 +69,8 @@ std::chrono::milliseconds BlockTime(const RenderSettings& settings, const FilmSp
 SchedulerOptions SchedulerOptionsOf(const CoordinatorOptions& options) {
   SchedulerOptions s;
   s.silence_time = options.silence_time;
+  s.reconnect_time = options.reconnect_time;
+  s.stall_time = options.stall_time;
   s.lease_time = options.lease_time;
   s.speculate_factor = options.speculate_factor;
   s.speculate_after = options.speculate_after;
@@ -74,6 +78,9 @@ SchedulerOptions SchedulerOptionsOf(const CoordinatorOptions& options) {
   s.max_tile_failures = options.max_tile_failures;
   s.max_worker_failures = options.max_worker_failures;
   s.set_aside_time = options.set_aside_time;
+  s.audit_fraction = options.audit_fraction;
+  s.decide_time = options.decide_time;
+  s.audit_seed = options.audit_seed;
   return s;
 }
 
@@ -95,8 +102,7 @@ class CoordinatorImpl final : public Coordinator {
       draining_ = true;
       if (bake_in_work_) *bake_in_work_->stop = true;
     }
-    changed_.notify_all();
-    stop_ticker_.notify_all();
+    NotifyAll();
     if (ticker_.joinable()) ticker_.join();
     if (bakery_.joinable()) bakery_.join();
   }
@@ -182,9 +188,9 @@ class CoordinatorImpl final : public Coordinator {
     jobs_.emplace(id, job);
     TakeUp(*job, {});
     Log(LogLevel::kInfo, "submitted", id);
-    FailOrphans();
+    if (!job->stored.spec.after.empty()) FailOrphans();
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return id;
   }
 
@@ -218,7 +224,7 @@ class CoordinatorImpl final : public Coordinator {
     Log(LogLevel::kInfo, "cancelled", id);
     EndJob(*job, JobState::kCancelled, absl::OkStatus());
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
   }
 
@@ -241,7 +247,7 @@ class CoordinatorImpl final : public Coordinator {
       JobLog(*job, {.text = "the priority is " + std::to_string(priority) + " now"});
     }
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
   }
 
@@ -285,7 +291,7 @@ class CoordinatorImpl final : public Coordinator {
       FinishIfDone(*job);
     }
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
   }
 
@@ -331,7 +337,7 @@ class CoordinatorImpl final : public Coordinator {
         return events;
       }
       if (ended) return std::vector<JobEvent>{};
-      const bool woken = changed_.wait_until(
+      const bool woken = events_.wait_until(
           lock, deadline, [&] { return stopping_ || draining_ || job->changes != seen; });
       if (woken && job->changes != seen) continue;
       if (woken) return Draining();
@@ -437,6 +443,7 @@ class CoordinatorImpl final : public Coordinator {
                       .film = job.stored.spec.film,
                       .settings = job.stored.spec.settings};
         work.blobs = frame.blobs;
+        work.careful = grant->careful;
         work.lease_time = std::max(options_.lease_time,
                                    BlockTime(job.stored.spec.settings, job.stored.spec.film));
         return work;
@@ -444,7 +451,7 @@ class CoordinatorImpl final : public Coordinator {
       const auto now = std::chrono::steady_clock::now();
       if (now >= deadline) return std::nullopt;
       // Tiles become slow and workers come back from being set aside without a notification.
-      changed_.wait_until(lock, std::min(deadline, now + std::chrono::milliseconds(500)));
+      work_.wait_until(lock, std::min(deadline, now + std::chrono::milliseconds(500)));
     }
   }
 
@@ -458,6 +465,7 @@ class CoordinatorImpl final : public Coordinator {
   absl::StatusOr<ReturnAnswer> Return(const WorkerId& worker, const TileResult& result) override {
     LeaseGrant grant;
     Digest fingerprint;
+    std::string worker_name;
     PixelRect rect;
     std::vector<Layer> layers;
     {
@@ -482,6 +490,7 @@ class CoordinatorImpl final : public Coordinator {
       rect = job.tiles[grant.tile % job.tiles.size()];
       layers = job.stored.spec.settings.layers;
       fingerprint = scheduler_.FindWorker(worker)->fingerprint;
+      worker_name = WorkerName(worker);
     }
 
     // Reading and storing take their time: without the lock. The lease is pinned meanwhile.
@@ -489,26 +498,31 @@ class CoordinatorImpl final : public Coordinator {
       std::unique_lock lock(mutex_);
       HandleNews(scheduler_.RefuseResult(result.lease, std::string(wrong.message())));
       lock.unlock();
-      changed_.notify_all();
+      NotifyAll();
       return ReturnAnswer{.accepted = false, .reason = std::string(wrong.message())};
     }
-    absl::Status stored = store_->CommitTile(grant.job, grant.tile, result, fingerprint);
+    if (grant.audit) return ReturnAudit(grant, result);
+    absl::Status stored =
+        store_->CommitTile(grant.job, grant.tile, result, fingerprint, worker_name);
     if (absl::IsAlreadyExists(stored)) stored = absl::OkStatus();
 
     std::unique_lock lock(mutex_);
-    const bool counted = scheduler_.FinishCommit(result.lease, stored.ok());
+    const bool counted = scheduler_.FinishCommit(result.lease, stored.ok(), result.sha256);
+    bool more_work = !stored.ok();
     const auto at = jobs_.find(grant.job);
     if (stored.ok() && at != jobs_.end()) {
       Job& job = *at->second;
       ++job.changes;
       if (counted) {
         if (job.stored.fingerprint.empty()) job.stored.fingerprint = fingerprint;
-        CountCommitted(job, grant.tile);
+        more_work = CountCommitted(job, grant.tile);
         FinishIfDone(job);
       } else if (!IsFinal(job.stored.state)) {
-        // The job was taken up anew while this was stored, and knows nothing of the tile.
+        // The job was taken up anew while this was stored, or the worker was found to return wrong
+        // pixels: the tile is queued.
         stored = store_->DropTiles(grant.job, {grant.tile});
-        if (stored.ok()) stored = absl::FailedPreconditionError("the job was requeued meanwhile");
+        if (stored.ok()) stored = absl::FailedPreconditionError("the lease has ended meanwhile");
+        more_work = true;
       }
     }
     if (stored.ok()) {
@@ -517,7 +531,9 @@ class CoordinatorImpl final : public Coordinator {
       LogLease(LogLevel::kError, "not committed: " + stored.ToString(), grant);
     }
     lock.unlock();
-    changed_.notify_all();
+    // Workers that wait have nothing from a tile that is done: with hundreds of them this matters.
+    events_.notify_all();
+    if (more_work) NotifyAll();
     if (stored.ok()) return ReturnAnswer{.accepted = true};
     if (absl::IsFailedPrecondition(stored) || absl::IsNotFound(stored)) {
       return ReturnAnswer{.accepted = false, .reason = std::string(stored.message())};
@@ -543,7 +559,7 @@ class CoordinatorImpl final : public Coordinator {
     }
     HandleNews(scheduler_.ReportFailure(worker, lease, given_back, error));
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
   }
 
@@ -553,8 +569,18 @@ class CoordinatorImpl final : public Coordinator {
     scheduler_.RemoveWorker(worker);
     LogWorker(LogLevel::kInfo, "left", worker);
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
+  }
+
+  absl::StatusOr<uint64_t> Attached(const WorkerId& worker) override {
+    std::lock_guard lock(mutex_);
+    if (!scheduler_.HasWorker(worker)) return UnknownWorker(worker);
+    return scheduler_.Connected(worker);
+  }
+  void Detached(const WorkerId& worker, uint64_t connection) override {
+    std::lock_guard lock(mutex_);
+    scheduler_.Disconnected(worker, connection);
   }
 
   void Drain() override {
@@ -562,7 +588,7 @@ class CoordinatorImpl final : public Coordinator {
       std::lock_guard lock(mutex_);
       draining_ = true;
     }
-    changed_.notify_all();
+    NotifyAll();
   }
   uint32_t ActiveLeases() override {
     std::lock_guard lock(mutex_);
@@ -606,7 +632,71 @@ class CoordinatorImpl final : public Coordinator {
     return absl::NotFoundError("worker " + worker.value + " is not registered; register again");
   }
 
+  void NotifyAll() {
+    work_.notify_all();
+    events_.notify_all();
+    bakes_.notify_all();
+    stop_ticker_.notify_all();
+  }
+
+  // The result of an audit: compared, never stored. Without the lock.
+  ReturnAnswer ReturnAudit(const LeaseGrant& grant, const TileResult& result) {
+    std::unique_lock lock(mutex_);
+    const AuditVerdict verdict = scheduler_.FinishAudit(grant.lease, result.sha256);
+    if (!verdict.counted) return {.accepted = false, .reason = "the lease has ended"};
+    LogLease(LogLevel::kInfo, "audited", grant);
+    const auto at = jobs_.find(grant.job);
+    if (at != jobs_.end() && verdict.disputed) {
+      JobLog(*at->second,
+             {.level = LogLevel::kWarning,
+              .text = "an audit gave other pixels than the tile has: another worker is asked",
+              .tile = grant.tile,
+              .worker = WorkerName(grant.worker)});
+    }
+    for (const AuditVerdict::Convict& convict : verdict.convicted) {
+      const std::string text =
+          "worker '" + convict.name +
+          "' returned pixels that two others did not: it is set aside for good, and its tiles are "
+          "rendered again; test its memory and processor";
+      LogWorker(LogLevel::kError, text, convict.id);
+      for (const auto& [id, tiles] : verdict.reopened) {
+        if (const auto job = jobs_.find(id); job != jobs_.end()) {
+          JobLog(*job->second, {.level = LogLevel::kError, .text = text, .worker = convict.name});
+        }
+      }
+    }
+    for (const auto& [id, tiles] : verdict.reopened) {
+      if (const auto job = jobs_.find(id); job != jobs_.end()) Reopen(*job->second, tiles);
+    }
+    if (at != jobs_.end()) FinishIfDone(*at->second);
+    lock.unlock();
+    NotifyAll();
+    return {.accepted = true};
+  }
+
   // --- All below need mutex_ unless they say otherwise ---
+
+  // Committed tiles that are queued again: the scheduler knows already.
+  void Reopen(Job& job, const std::vector<uint32_t>& tiles) {
+    const JobId& id = job.stored.id;
+    if (const absl::Status dropped = store_->DropTiles(id, tiles); !dropped.ok()) {
+      FailJob(job, Annotate(dropped, "wrong tiles cannot be dropped"));
+      return;
+    }
+    for (const uint32_t tile : tiles) {
+      const uint32_t frame = job.frame_of(tile);
+      if (job.committed[frame]-- == job.tiles.size()) --job.frames_done;
+    }
+    ++job.changes;
+    for (const uint32_t tile : tiles) {
+      const auto baked = job.stored.frames.find(job.frame_of(tile));
+      if (baked != job.stored.frames.end() && HaveBlobs(baked->second.blobs)) continue;
+      FailJob(job,
+              absl::DataLossError("a worker returned wrong pixels, and the blobs to render its "
+                                  "tiles again are gone; requeue the job"));
+      return;
+    }
+  }
 
   absl::StatusOr<std::shared_ptr<Job>> Find(const JobId& id) const {
     const auto at = jobs_.find(id);
@@ -756,7 +846,7 @@ class CoordinatorImpl final : public Coordinator {
     scheduler_.SetPaused(id, paused);
     Log(LogLevel::kInfo, paused ? "paused" : "resumed", id);
     lock.unlock();
-    changed_.notify_all();
+    NotifyAll();
     return absl::OkStatus();
   }
 
@@ -779,6 +869,14 @@ class CoordinatorImpl final : public Coordinator {
                              .attempt = lost.grant.attempt,
                              .worker = lost.worker_name});
       }
+    }
+    for (const SetAsideTile& poison : news.set_aside) {
+      const auto at = jobs_.find(poison.job);
+      if (at == jobs_.end() || IsFinal(at->second->stored.state)) continue;
+      JobLog(*at->second, {.level = LogLevel::kError,
+                           .text = "the tile is set aside; the others go on",
+                           .tile = poison.tile});
+      FinishIfDone(*at->second);
     }
     for (const FailedJob& failed : news.failed) {
       const auto at = jobs_.find(failed.job);
@@ -827,6 +925,7 @@ class CoordinatorImpl final : public Coordinator {
     for (const StoredTile& tile : committed) {
       if (tile.tile >= scheduled.tiles) continue;
       scheduled.committed.push_back(tile.tile);
+      scheduled.committed_by.push_back(tile.worker);
       ++job.committed[job.frame_of(tile.tile)];
     }
     if (!committed.empty()) scheduled.fingerprint = stored.fingerprint;
@@ -858,20 +957,80 @@ class CoordinatorImpl final : public Coordinator {
     while (job.has_frames_to_bake() && job.ready[job.next_bake]) ++job.next_bake;
   }
 
-  void CountCommitted(Job& job, uint32_t tile) {
+  // True if that may let a bake begin or a worker find something to do.
+  bool CountCommitted(Job& job, uint32_t tile) {
     const uint32_t frame = job.frame_of(tile);
-    if (++job.committed[frame] < job.tiles.size()) return;
+    if (++job.committed[frame] < job.tiles.size()) {
+      return job.has_frames_to_bake() &&
+             scheduler_.Leasable(job.stored.id) < kTilesAheadPerWorker * scheduler_.worker_count();
+    }
     ++job.frames_done;
     if (!job.stored.spec.frames.empty()) {
       Log(LogLevel::kInfo, FrameName(job, frame) + " is done", job.stored.id);
     }
     ReleaseBlobs(job, frame);
+    return true;
+  }
+
+  // "tile 7 of frame 3 (pixels 32 to 63 across, 0 to 31 down)".
+  std::string TileName(const Job& job, uint32_t tile) const {
+    const PixelRect& r = job.tiles[tile % job.tiles.size()];
+    std::string text = "tile " + std::to_string(tile);
+    if (!job.stored.spec.frames.empty()) text += " of " + FrameName(job, job.frame_of(tile));
+    return text + " (pixels " + std::to_string(r.x0) + " to " + std::to_string(r.x1 - 1) +
+           " across, " + std::to_string(r.y0) + " to " + std::to_string(r.y1 - 1) + " down)";
+  }
+
+  // Of a job of which only tiles that were set aside are left.
+  absl::Status PoisonError(const Job& job) const {
+    std::string text;
+    uint32_t count = 0;
+    for (const TroubledTile& tile : scheduler_.Report(job.stored.id).troubled) {
+      if (!tile.set_aside || ++count > kProblems) continue;
+      text += (text.empty() ? "" : "; ") + TileName(job, tile.tile) + " failed " +
+              std::to_string(tile.failures) + " times on " + std::to_string(tile.workers) +
+              " workers, the last cause: " + tile.cause;
+    }
+    if (count > kProblems) text += "; and " + std::to_string(count - kProblems) + " more";
+    return absl::AbortedError(text +
+                              "; all other tiles are done: see the workers' logs, then `farpoint "
+                              "requeue` tries the rest again");
+  }
+
+  absl::Status UndecidedError(const Job& job, const std::vector<uint32_t>& disputed) const {
+    return absl::AbortedError(
+        TileName(job, disputed.front()) +
+        (disputed.size() > 1 ? " and " + std::to_string(disputed.size() - 1) + " more" : "") +
+        ": two workers returned different pixels, and no third one was there to tell who is "
+        "right; connect another worker, then `farpoint requeue`");
   }
 
   void FinishIfDone(Job& job) {
     const JobId& id = job.stored.id;
     const TileCounts counts = scheduler_.Counts(id);
-    if (IsFinal(job.stored.state) || counts.committed != counts.total) return;
+    if (IsFinal(job.stored.state) || counts.committed + counts.failed != counts.total) return;
+    switch (scheduler_.Audits(id)) {
+      case AuditState::kOpen:
+        waiting_for_audits_.insert(id);  // the ticker looks again
+        return;
+      case AuditState::kUndecided: {
+        const std::vector<uint32_t> disputed = scheduler_.DisputedTiles(id);
+        FailJob(job, UndecidedError(job, disputed));
+        job.final_counts.committed -= static_cast<uint32_t>(disputed.size());
+        job.final_counts.failed += static_cast<uint32_t>(disputed.size());
+        if (const absl::Status s = store_->DropTiles(id, disputed); !s.ok()) {
+          Log(LogLevel::kError, "disputed tiles not dropped: " + s.ToString(), id);
+        }
+        return;
+      }
+      case AuditState::kNone:
+        break;
+    }
+    waiting_for_audits_.erase(id);
+    if (counts.failed > 0) {
+      FailJob(job, PoisonError(job));
+      return;
+    }
     // If this fails or the process dies first, the store is opened again with all tiles committed,
     // and the job is found done.
     const absl::Status done = store_->SetState(id, JobState::kDone, absl::OkStatus());
@@ -900,7 +1059,10 @@ class CoordinatorImpl final : public Coordinator {
   // would not fit. On a disk they stay until the retention time is over.
   void ReleaseBlobs(const Job& job, uint32_t frame) {
     const auto at = job.stored.frames.find(frame);
-    if (!options_.store_directory.empty() || !job.animated || at == job.stored.frames.end()) return;
+    if (!options_.store_directory.empty() || options_.audit_fraction > 0 || !job.animated ||
+        at == job.stored.frames.end()) {
+      return;
+    }
     const SceneBlobs& blobs = at->second.blobs;
     released_.insert({blobs.prepared_scene, blobs.tree_topology, blobs.tree_radiance});
     DropReleased();
@@ -942,7 +1104,8 @@ class CoordinatorImpl final : public Coordinator {
       if (s.state == JobState::kFailed) (void)store_->SetState(id, s.state, s.error);
       return absl::OkStatus();
     }
-    FP_ASSIGN_OR_RETURN(const std::vector<uint32_t> damaged, store_->DropDamagedTiles(id));
+    FP_ASSIGN_OR_RETURN(const std::vector<uint32_t> damaged,
+                        store_->DropDamagedTiles(id, kReadAtRestart));
     if (!damaged.empty()) {
       Log(LogLevel::kWarning,
           std::to_string(damaged.size()) + " tiles were damaged and are rendered again", id);
@@ -982,7 +1145,7 @@ class CoordinatorImpl final : public Coordinator {
 
   void TickLoop() {
     const auto period = std::clamp<std::chrono::milliseconds>(
-        options_.silence_time / 10, std::chrono::milliseconds(5), std::chrono::milliseconds(500));
+        options_.silence_time / 40, std::chrono::milliseconds(5), std::chrono::milliseconds(100));
     auto next_save = std::chrono::steady_clock::now() + std::chrono::seconds(5);
     auto next_purge = std::chrono::steady_clock::now() + std::chrono::hours(1);
     std::unique_lock lock(mutex_);
@@ -993,6 +1156,10 @@ class CoordinatorImpl final : public Coordinator {
       if (gap > options_.silence_time / 2) scheduler_.Forgive(gap);
       const SchedulerNews news = scheduler_.Tick();
       HandleNews(news);
+      const std::set<JobId> audited = std::exchange(waiting_for_audits_, {});
+      for (const JobId& id : audited) {
+        if (const auto at = jobs_.find(id); at != jobs_.end()) FinishIfDone(*at->second);
+      }
       const auto now = std::chrono::steady_clock::now();
       if (now >= next_save) {
         next_save = now + std::chrono::seconds(5);
@@ -1009,7 +1176,7 @@ class CoordinatorImpl final : public Coordinator {
         next_purge = now + std::chrono::hours(1);
         PurgeOld();
       }
-      if (!news.lost.empty() || !news.failed.empty()) changed_.notify_all();
+      if (!news.lost.empty() || !news.failed.empty() || !audited.empty()) NotifyAll();
       stop_ticker_.wait_for(lock, period, [this] { return stopping_; });
     }
   }
@@ -1069,7 +1236,7 @@ class CoordinatorImpl final : public Coordinator {
       const std::vector<std::shared_ptr<Job>> queue =
           draining_ ? std::vector<std::shared_ptr<Job>>() : BakeQueue();
       if (queue.empty()) {
-        changed_.wait(lock);
+        bakes_.wait(lock);
         continue;
       }
       const std::shared_ptr<Job> job = queue.front();
@@ -1078,12 +1245,12 @@ class CoordinatorImpl final : public Coordinator {
         if (const absl::Status s = store_->SetState(id, JobState::kBaking, absl::OkStatus());
             !s.ok()) {
           FailJob(*job, s);
-          changed_.notify_all();
+          NotifyAll();
           continue;
         }
         job->stored.state = JobState::kBaking;
         ++job->changes;
-        changed_.notify_all();
+        NotifyAll();
       }
       BakeInWork work{
           .job = id, .frame = job->next_bake, .life = job->life, .since = clock_->Now()};
@@ -1097,7 +1264,7 @@ class CoordinatorImpl final : public Coordinator {
       if (stopping_ || job->life != work.life) continue;
       FinishBake(*job, work, spec, std::move(baked));
       DropReleased();
-      changed_.notify_all();
+      NotifyAll();
     }
   }
 
@@ -1232,14 +1399,17 @@ class CoordinatorImpl final : public Coordinator {
 
   std::mutex requeue_mutex_;  // before mutex_
   std::mutex mutex_;
-  // Something that somebody waits for has happened: work, events, jobs to bake, the end.
-  std::condition_variable changed_;
+  // What each kind of waiter waits for, and the end.
+  std::condition_variable work_;    // workers: a tile may be leased
+  std::condition_variable events_;  // watchers: a job has changed
+  std::condition_variable bakes_;   // the thread that bakes: a frame may be baked
   std::condition_variable stop_ticker_;
   TileScheduler scheduler_;                     // guarded by mutex_
   std::map<JobId, std::shared_ptr<Job>> jobs_;  // guarded by mutex_
   std::optional<BakeInWork> bake_in_work_;      // guarded by mutex_
   std::set<Digest> released_;                   // guarded by mutex_
   std::map<JobId, uint64_t> saved_counters_;    // guarded by mutex_
+  std::set<JobId> waiting_for_audits_;          // all tiles committed; guarded by mutex_
   bool draining_ = false, stopping_ = false;    // guarded by mutex_
   std::thread ticker_, bakery_;
 };
@@ -1249,9 +1419,13 @@ class CoordinatorImpl final : public Coordinator {
 absl::StatusOr<std::unique_ptr<Coordinator>> Coordinator::Open(CoordinatorOptions options) {
   FP_CHECK(options.baker != nullptr);
   std::string blob_folder;
-  if (!options.store_directory.empty()) blob_folder = options.store_directory + "/blobs";
+  if (!options.store_directory.empty()) {
+    blob_folder = options.blob_directory.empty() ? options.store_directory + "/blobs"
+                                                 : options.blob_directory;
+  }
   // The job store first: it holds the lock of the folder.
-  FP_ASSIGN_OR_RETURN(std::unique_ptr<JobStore> store, JobStore::Open(options.store_directory));
+  FP_ASSIGN_OR_RETURN(std::unique_ptr<JobStore> store,
+                      JobStore::Open(options.store_directory, options.store_hook));
   FP_ASSIGN_OR_RETURN(std::unique_ptr<BlobStore> blobs,
                       BlobStore::Open(blob_folder, options.max_blob_bytes));
   auto coordinator =

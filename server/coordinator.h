@@ -37,6 +37,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "core/base/blob.h"
@@ -114,6 +115,11 @@ class CoordinatorApi {
   virtual absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                                      const absl::Status& error) = 0;
   virtual absl::Status Leave(const WorkerId& worker) = 0;
+  // The worker has opened, and lost, the connection that tells that it lives. Detached takes what
+  // Attached returned; a worker that does not come back within reconnect_time is taken for lost.
+  // Attached: kNotFound as Lease.
+  virtual absl::StatusOr<uint64_t> Attached(const WorkerId& worker) = 0;
+  virtual void Detached(const WorkerId& worker, uint64_t connection) = 0;
 };
 
 // What a caller may want to log. From any thread; the callee must not call the coordinator.
@@ -130,28 +136,41 @@ struct CoordinatorLogEntry {
 struct CoordinatorOptions {
   // Everything that must survive lies below it; created if absent. Empty: all in memory.
   std::string store_directory;
+  // Where blobs lie, if not in the folder `blobs` of the store: a site's shared file system, from
+  // which workers take them (worker/blob_cache.h). Ignored without a store.
+  std::string blob_directory;
   std::shared_ptr<SceneBaker> baker;  // required
   JobLimits limits;                   // of every job
   uint64_t max_blob_bytes = uint64_t{1} << 36;
 
-  // A lease is lost when nothing was heard of its worker for silence_time, or when its progress
-  // stood still for lease_time.
-  std::chrono::milliseconds silence_time{5000};
+  // A lease is lost when nothing was heard of its worker for silence_time, when the connection to
+  // it broke and did not come back within reconnect_time, when its progress stood still for
+  // lease_time, or when a thread that renders uses no processor for stall_time.
+  std::chrono::milliseconds silence_time{4000};
+  std::chrono::milliseconds reconnect_time{500};
   std::chrono::milliseconds lease_time{120000};
+  std::chrono::milliseconds stall_time{3000};
   std::chrono::milliseconds heartbeat{1000};  // how often workers shall renew
   // A tile is copied to an idle worker when it takes this many times the job's median, and at
-  // least speculate_after.
+  // least speculate_after; at once where its worker is known to be slow.
   double speculate_factor = 3;
-  std::chrono::milliseconds speculate_after{5000};
+  std::chrono::milliseconds speculate_after{1000};
   uint32_t max_dead_workers = 3;     // different workers that a tile may take down
   uint32_t max_tile_failures = 6;    // by whomever
   uint32_t max_worker_failures = 3;  // in a row, then the worker is set aside for …
   std::chrono::milliseconds set_aside_time{60000};
+  // The share of committed tiles that another worker renders again in secret, 0 to 1. A job is not
+  // done before its audits are; where there is no other worker, there are none.
+  double audit_fraction = 0;
+  std::chrono::milliseconds decide_time{60000};  // how long a disagreement waits for a third worker
+  uint64_t audit_seed = 0;                       // 0: random
   // Jobs that ended so long ago are purged with their tiles, and blobs that no job needs any more.
   std::chrono::hours retention{24 * 7};
 
   std::function<void(const CoordinatorLogEntry&)> log;  // may be empty
   std::shared_ptr<const Clock> clock;                   // none: SteadyClock
+  // For tests: see StoreHook (server/job_store.h).
+  std::function<void(std::string_view point)> store_hook;
 };
 
 class Coordinator : public CoordinatorApi {

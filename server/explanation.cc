@@ -167,9 +167,17 @@ void ExplainTiles(const ExplanationFacts& facts, std::vector<std::string>& lines
   const auto& troubled = facts.report.troubled;
   for (size_t i = 0; i < std::min(kTilesShown, troubled.size()); ++i) {
     const TroubledTile& tile = troubled[i];
-    lines.push_back(TileText(facts, tile.tile) + " failed " +
+    lines.push_back(TileText(facts, tile.tile) +
+                    (tile.set_aside ? " is set aside, it failed " : " failed ") +
                     Count(tile.failures, "time", "times") + " on " +
                     Count(tile.workers, "worker", "workers") + ", lately: " + tile.cause);
+  }
+  if (facts.report.audits_done + facts.report.audits_differ > 0) {
+    lines.push_back("audits: other workers rendered " +
+                    Count(facts.report.audits_done, "tile", "tiles") + " again; " +
+                    (facts.report.audits_differ == 0
+                         ? std::string("all alike")
+                         : std::to_string(facts.report.audits_differ) + " came out otherwise"));
   }
   for (const TileSeconds& tile : facts.slowest) {
     lines.push_back(TileText(facts, tile.tile) + " took " + Seconds(tile.seconds) +

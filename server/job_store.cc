@@ -3,18 +3,23 @@
 #include <fcntl.h>
 #include <sqlite3.h>
 #include <sys/file.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
 #include <chrono>
+#include <condition_variable>
 #include <cstring>
+#include <deque>
 #include <filesystem>
 #include <iterator>
 #include <mutex>
 #include <set>
+#include <span>
 
 #include "core/base/check.h"
+#include "core/base/posix_file.h"
 #include "proto/convert.h"
 #include "proto/records.pb.h"
 
@@ -24,7 +29,7 @@ namespace fs = std::filesystem;
 
 namespace {
 
-constexpr int kSchemaVersion = 2;
+constexpr int kSchemaVersion = 3;
 constexpr const char* kSchema = R"sql(
 CREATE TABLE jobs (
   number INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -54,6 +59,9 @@ CREATE TABLE tiles (
   sha256 BLOB NOT NULL,
   size INTEGER NOT NULL,
   stats BLOB NOT NULL,
+  segment INTEGER,
+  offset INTEGER,
+  worker TEXT NOT NULL DEFAULT '',
   PRIMARY KEY (job, tile)) WITHOUT ROWID;
 CREATE TABLE events (
   job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,
@@ -65,7 +73,8 @@ CREATE TABLE events (
   PRIMARY KEY (job, sequence)) WITHOUT ROWID;
 CREATE TABLE bakes (key BLOB PRIMARY KEY, record BLOB NOT NULL) WITHOUT ROWID;
 )sql";
-// From one version to the next. In version 1 a job was one frame, and its bake stood in its row.
+// From one version to the next. In version 1 a job was one frame, and its bake stood in its row; up
+// to version 2 each tile was a file of its own, which a tile without a segment still is.
 constexpr const char* kMigrations[] = {R"sql(
 CREATE TABLE frames (
   job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,
@@ -82,8 +91,17 @@ ALTER TABLE jobs DROP COLUMN blobs;
 ALTER TABLE jobs DROP COLUMN bake_stats;
 ALTER TABLE jobs ADD COLUMN paused INTEGER NOT NULL DEFAULT 0;
 ALTER TABLE events ADD COLUMN unix_ms INTEGER NOT NULL DEFAULT 0;
+)sql",
+                                       R"sql(
+ALTER TABLE tiles ADD COLUMN segment INTEGER;
+ALTER TABLE tiles ADD COLUMN offset INTEGER;
+ALTER TABLE tiles ADD COLUMN worker TEXT NOT NULL DEFAULT '';
 )sql"};
 static_assert(std::size(kMigrations) == kSchemaVersion - 1);
+
+// A tile larger than that begins a segment of its own; a batch of commits is no longer than that.
+constexpr uint64_t kSegmentBytes = uint64_t{1} << 30;
+constexpr size_t kMaxBatch = 1024;
 
 // events.kind
 constexpr int kStateEvent = 1;  // number: JobState
@@ -167,6 +185,13 @@ class Statement {
     return SqlError(db_, path_);
   }
   absl::Status Run() { return Step().status(); }
+  // Ready to be bound and run again.
+  Statement& Reset() {
+    sqlite3_reset(statement_);
+    if (result_ == SQLITE_DONE || result_ == SQLITE_ROW) result_ = SQLITE_OK;
+    next_ = 1;
+    return *this;
+  }
 
   int64_t GetInt(int column) const { return sqlite3_column_int64(statement_, column); }
   bool IsNull(int column) const { return sqlite3_column_type(statement_, column) == SQLITE_NULL; }
@@ -202,8 +227,9 @@ class SqliteJobStore final : public JobStore {
     if (lock_fd_ >= 0) ::close(lock_fd_);
   }
 
-  absl::Status Init(const std::string& directory) {
+  absl::Status Init(const std::string& directory, StoreHook hook) {
     directory_ = directory;
+    hook_ = std::move(hook);
     path_ = in_memory() ? ":memory:" : directory + "/jobs.sqlite";
     if (!in_memory()) {
       std::error_code error;
@@ -380,10 +406,11 @@ class SqliteJobStore final : public JobStore {
     if (!spec.ParseFromString(query.GetBytes(0))) return Damaged("a job's description");
     spec.set_priority(priority);
     Statement update(db_, path_, "UPDATE jobs SET spec = ? WHERE id = ?");
-    return update.Bytes(spec.SerializeAsString()).Text(job.value).Run();
+    return RunAlone(update.Bytes(spec.SerializeAsString()).Text(job.value));
   }
 
   absl::Status Requeue(const JobId& job, bool all) override {
+    std::lock_guard segments(segments_mutex_);
     std::lock_guard lock(mutex_);
     Transaction transaction(*this);
     FP_RETURN_IF_ERROR(transaction.Begin());
@@ -414,50 +441,36 @@ class SqliteJobStore final : public JobStore {
   absl::Status SaveCounters(const JobId& job, uint64_t reissued, uint64_t refused) override {
     std::lock_guard lock(mutex_);
     Statement update(db_, path_, "UPDATE jobs SET reissued = ?, refused = ? WHERE id = ?");
-    return update.Int(static_cast<int64_t>(reissued))
-        .Int(static_cast<int64_t>(refused))
-        .Text(job.value)
-        .Run();
+    return RunAlone(update.Int(static_cast<int64_t>(reissued))
+                        .Int(static_cast<int64_t>(refused))
+                        .Text(job.value));
   }
 
   absl::Status CommitTile(const JobId& job, uint32_t tile, const TileResult& result,
-                          const Digest& fingerprint) override {
-    // The bytes first: a file without a row is overwritten, a row without a file must not be.
-    {
-      std::lock_guard lock(mutex_);
-      FP_RETURN_IF_ERROR(MayCommit(job, tile));
-    }
-    if (!in_memory()) {
-      std::error_code error;
-      fs::create_directory(TileFolder(job), error);
-      if (error) {
-        return absl::UnavailableError("cannot create '" + TileFolder(job) +
-                                      "': " + error.message());
+                          const Digest& fingerprint, const std::string& worker) override {
+    PendingTile mine{
+        .job = job, .tile = tile, .result = result, .fingerprint = fingerprint, .worker = worker};
+    std::unique_lock lock(queue_mutex_);
+    queue_.push_back(&mine);
+    // Whoever finds nobody at work commits all that have come so far, for itself and the others.
+    while (!mine.done) {
+      if (leading_) {
+        batch_done_.wait(lock);
+        continue;
       }
-      FP_RETURN_IF_ERROR(WriteFileAtomically(TilePath(job, tile), result.bytes.bytes()));
+      leading_ = true;
+      const size_t count = std::min(queue_.size(), kMaxBatch);
+      const std::vector<PendingTile*> batch(queue_.begin(),
+                                            queue_.begin() + static_cast<ptrdiff_t>(count));
+      queue_.erase(queue_.begin(), queue_.begin() + static_cast<ptrdiff_t>(count));
+      lock.unlock();
+      CommitBatch(batch);
+      lock.lock();
+      for (PendingTile* one : batch) one->done = true;
+      leading_ = false;
+      batch_done_.notify_all();
     }
-    std::lock_guard lock(mutex_);
-    FP_RETURN_IF_ERROR(MayCommit(job, tile));
-    Transaction transaction(*this);
-    FP_RETURN_IF_ERROR(transaction.Begin());
-    Statement insert(db_, path_,
-                     "INSERT INTO tiles (job, tile, sha256, size, stats) "
-                     "VALUES ((SELECT number FROM jobs WHERE id = ?), ?, ?, ?, ?)");
-    FP_RETURN_IF_ERROR(insert.Text(job.value)
-                           .Int(tile)
-                           .Hash(result.sha256)
-                           .Int(static_cast<int64_t>(result.bytes.size()))
-                           .Bytes(ToWire(result.stats).SerializeAsString())
-                           .Run());
-    Statement first(db_, path_,
-                    "UPDATE jobs SET fingerprint = ? WHERE id = ? AND fingerprint IS NULL");
-    FP_RETURN_IF_ERROR(first.Hash(fingerprint).Text(job.value).Run());
-    FP_RETURN_IF_ERROR(AddEvent(
-        job, kTileEvent, tile,
-        {reinterpret_cast<const char*>(result.sha256.bytes.data()), result.sha256.bytes.size()}));
-    FP_RETURN_IF_ERROR(transaction.Commit());
-    if (in_memory()) tiles_[{job, tile}] = result.bytes;
-    return absl::OkStatus();
+    return mine.status;
   }
 
   absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) override {
@@ -497,11 +510,13 @@ class SqliteJobStore final : public JobStore {
   absl::StatusOr<TileData> ReadTile(const JobId& job, uint32_t tile) override {
     TileData data;
     data.tile = tile;
-    uint64_t size = 0;
+    uint64_t size = 0, offset = 0;
+    std::string path = TilePath(job, tile);
+    bool own_file = true;
     {
       std::lock_guard lock(mutex_);
       Statement query(db_, path_,
-                      "SELECT sha256, size FROM tiles WHERE tile = ? AND job = "
+                      "SELECT sha256, size, segment, offset FROM tiles WHERE tile = ? AND job = "
                       "(SELECT number FROM jobs WHERE id = ?)");
       FP_ASSIGN_OR_RETURN(const bool row, query.Int(tile).Text(job.value).Step());
       if (!row) {
@@ -514,9 +529,14 @@ class SqliteJobStore final : public JobStore {
         data.bytes = tiles_.at({job, tile});
         return data;
       }
+      own_file = query.IsNull(2);
+      if (!own_file) {
+        path = SegmentPath(job, query.GetInt(2));
+        offset = static_cast<uint64_t>(query.GetInt(3));
+      }
     }
-    const std::string path = TilePath(job, tile);
-    const absl::StatusOr<Blob> bytes = ReadFile(path, size);
+    const absl::StatusOr<Blob> bytes =
+        own_file ? ReadFile(path, size) : ReadPart(path, offset, size);
     if (bytes.ok() && bytes->size() == size && bytes->Hash() == data.sha256) {
       data.bytes = *bytes;
       return data;
@@ -525,16 +545,26 @@ class SqliteJobStore final : public JobStore {
     return absl::DataLossError("'" + path + "' is missing or damaged; submit the job again");
   }
 
-  absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(const JobId& job) override {
+  absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(const JobId& job,
+                                                         uint64_t read_bytes) override {
     std::vector<uint32_t> dropped;
     FP_ASSIGN_OR_RETURN(const std::vector<StoredTile> tiles, Tiles(job));
+    uint64_t read = 0;
     for (const StoredTile& tile : tiles) {
+      if (read >= read_bytes) break;
+      read += tile.size_bytes;
       const absl::Status status = ReadTile(job, tile.tile).status();
       if (absl::IsDataLoss(status)) {
         dropped.push_back(tile.tile);
       } else if (!status.ok()) {
         return status;
       }
+    }
+    if (read >= read_bytes) {
+      FP_ASSIGN_OR_RETURN(const std::vector<uint32_t> missing, TilesWithoutBytes(job));
+      dropped.insert(dropped.end(), missing.begin(), missing.end());
+      std::sort(dropped.begin(), dropped.end());
+      dropped.erase(std::unique(dropped.begin(), dropped.end()), dropped.end());
     }
     FP_RETURN_IF_ERROR(DropTiles(job, dropped));
     return dropped;
@@ -592,8 +622,10 @@ class SqliteJobStore final : public JobStore {
                 " lines: what happens from here on stands in the coordinator's log only";
     const bool full = at->second == kMaxLogLines;
     const LogLine& written = full ? last : line;
+    At("before a line of the log");
     FP_RETURN_IF_ERROR(AddEvent(job, kLogEvent, static_cast<int64_t>(written.level),
                                 ToWire(written).SerializeAsString()));
+    At("after a line of the log");
     ++at->second;
     return true;
   }
@@ -647,16 +679,17 @@ class SqliteJobStore final : public JobStore {
     *record.mutable_stats() = ToWire(bake.stats);
     std::lock_guard lock(mutex_);
     Statement put(db_, path_, "INSERT OR REPLACE INTO bakes (key, record) VALUES (?, ?)");
-    return put.Hash(key).Bytes(record.SerializeAsString()).Run();
+    return RunAlone(put.Hash(key).Bytes(record.SerializeAsString()));
   }
 
   absl::Status RemoveBake(const Digest& key) override {
     std::lock_guard lock(mutex_);
     Statement remove(db_, path_, "DELETE FROM bakes WHERE key = ?");
-    return remove.Hash(key).Run();
+    return RunAlone(remove.Hash(key));
   }
 
   absl::StatusOr<std::vector<JobId>> Purge(int64_t unix_ms, const std::set<JobId>& keep) override {
+    std::lock_guard segments(segments_mutex_);
     std::lock_guard lock(mutex_);
     std::vector<JobId> ids;
     {
@@ -670,7 +703,7 @@ class SqliteJobStore final : public JobStore {
     }
     for (const JobId& id : ids) {
       Statement remove(db_, path_, "DELETE FROM jobs WHERE id = ?");
-      FP_RETURN_IF_ERROR(remove.Text(id.value).Run());
+      FP_RETURN_IF_ERROR(RunAlone(remove.Text(id.value)));
       RemoveTileBytes(id);
       log_lines_.erase(id);
     }
@@ -690,8 +723,10 @@ class SqliteJobStore final : public JobStore {
       return absl::OkStatus();
     }
     absl::Status Commit() {
+      store_.At("before a commit");
       FP_RETURN_IF_ERROR(store_.Execute("COMMIT"));
       open_ = false;
+      store_.At("after a commit");
       return absl::OkStatus();
     }
 
@@ -700,7 +735,40 @@ class SqliteJobStore final : public JobStore {
     bool open_ = false;
   };
 
+  // A tile on its way into the store; lives on the stack of its CommitTile.
+  struct PendingTile {
+    const JobId& job;
+    uint32_t tile;
+    const TileResult& result;
+    const Digest& fingerprint;
+    const std::string& worker;
+    int64_t segment = 0;
+    uint64_t offset = 0;
+    absl::Status status;
+    bool done = false;  // guarded by queue_mutex_
+  };
+  // The file that the tiles of a job are appended to now.
+  struct Segment {
+    int64_t number = 0;
+    Descriptor file;
+    uint64_t size = 0;
+  };
+
+  void At(std::string_view point) const {
+    if (hook_) hook_(point);
+  }
+  // A change that is a transaction of its own.
+  absl::Status RunAlone(Statement& statement) {
+    At("before a statement");
+    FP_RETURN_IF_ERROR(statement.Run());
+    At("after a statement");
+    return absl::OkStatus();
+  }
+
   bool in_memory() const { return directory_.empty(); }
+  std::string SegmentPath(const JobId& job, int64_t number) const {
+    return TileFolder(job) + "/segment." + std::to_string(number);
+  }
   std::string TileFolder(const JobId& job) const { return directory_ + "/tiles/" + job.value; }
   std::string TilePath(const JobId& job, uint32_t tile) const {
     return TileFolder(job) + "/" + std::to_string(tile);
@@ -820,7 +888,219 @@ class SqliteJobStore final : public JobStore {
     return update.Bytes(lines.SerializeAsString()).Text(job.value).Run();
   }
 
+  // --- Commits in batches ---
+
+  // One batch at a time. Sets the status of each.
+  void CommitBatch(const std::vector<PendingTile*>& batch) {
+    std::lock_guard segments(segments_mutex_);
+    std::vector<PendingTile*> good;
+    {
+      std::lock_guard lock(mutex_);
+      std::set<std::pair<JobId, uint32_t>> seen;
+      for (PendingTile* one : batch) {
+        one->status = MayCommit(one->job, one->tile);
+        if (one->status.ok() && !seen.emplace(one->job, one->tile).second) {
+          one->status = CommittedAlready(one->job, one->tile);
+        }
+        if (one->status.ok()) good.push_back(one);
+      }
+    }
+    if (!in_memory()) {
+      WriteBytes(good);
+      std::erase_if(good, [](const PendingTile* one) { return !one->status.ok(); });
+    }
+    if (good.empty()) return;
+    if (InsertRows(good).ok()) return;
+    // One may have spoilt it for all.
+    for (PendingTile* one : good) one->status = InsertRows({one});
+  }
+
+  // The bytes before the rows: bytes without a row are never read, a row without bytes must not be.
+  void WriteBytes(const std::vector<PendingTile*>& batch) {
+    std::map<JobId, std::vector<PendingTile*>> by_job;
+    for (PendingTile* one : batch) by_job[one->job].push_back(one);
+    for (const auto& [job, tiles] : by_job) {
+      const absl::Status written = WriteSegment(job, tiles);
+      if (written.ok()) continue;
+      // Nobody knows what of it is on the disk: the next tiles begin another file.
+      segments_.erase(job);
+      for (PendingTile* one : tiles) one->status = written;
+    }
+  }
+
+  absl::Status WriteSegment(const JobId& job, const std::vector<PendingTile*>& tiles) {
+    uint64_t bytes = 0;
+    for (const PendingTile* one : tiles) bytes += one->result.bytes.size();
+    auto at = segments_.find(job);
+    if (at != segments_.end() && at->second.size + bytes > kSegmentBytes) {
+      segments_.erase(at);
+      at = segments_.end();
+    }
+    if (at == segments_.end()) {
+      FP_ASSIGN_OR_RETURN(Segment fresh, NewSegment(job));
+      at = segments_.emplace(job, std::move(fresh)).first;
+    }
+    Segment& segment = at->second;
+    const std::string path = SegmentPath(job, segment.number);
+    std::vector<std::byte> buffer;
+    buffer.reserve(bytes);
+    for (PendingTile* one : tiles) {
+      one->segment = segment.number;
+      one->offset = segment.size + buffer.size();
+      const std::span<const std::byte> more = one->result.bytes.bytes();
+      buffer.insert(buffer.end(), more.begin(), more.end());
+    }
+    At("before a tile's bytes");
+    std::span<const std::byte> rest(buffer);
+    if (hook_) {
+      // In two halves, so that a kill may come between them.
+      FP_RETURN_IF_ERROR(
+          WriteAllAt(segment.file.get(), segment.size, rest.first(rest.size() / 2), path));
+      At("amid a tile's bytes");
+      FP_RETURN_IF_ERROR(WriteAllAt(segment.file.get(), segment.size + rest.size() / 2,
+                                    rest.subspan(rest.size() / 2), path));
+    } else {
+      FP_RETURN_IF_ERROR(WriteAllAt(segment.file.get(), segment.size, rest, path));
+    }
+    At("before a tile's bytes are flushed");
+    if (::fdatasync(segment.file.get()) != 0) return DiskError("cannot flush", path, errno);
+    At("after a tile's bytes are flushed");
+    segment.size += buffer.size();
+    return absl::OkStatus();
+  }
+
+  // A file that nobody has written to.
+  absl::StatusOr<Segment> NewSegment(const JobId& job) {
+    std::error_code error;
+    const std::string folder = TileFolder(job);
+    fs::create_directories(folder, error);
+    if (error) return DiskError("cannot create", folder, error.value());
+    Segment segment;
+    for (segment.number = 1;; ++segment.number) {
+      const std::string path = SegmentPath(job, segment.number);
+      segment.file.Reset(::open(path.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0644));
+      if (segment.file.valid()) break;
+      if (errno != EEXIST) return DiskError("cannot create", path, errno);
+    }
+    SyncFolder(folder);
+    SyncFolder(directory_ + "/tiles");
+    return segment;
+  }
+
+  absl::Status InsertRows(const std::vector<PendingTile*>& batch) {
+    std::lock_guard lock(mutex_);
+    Transaction transaction(*this);
+    FP_RETURN_IF_ERROR(transaction.Begin());
+    Statement insert(db_, path_,
+                     "INSERT INTO tiles (job, tile, sha256, size, stats, segment, offset, worker) "
+                     "VALUES (?, ?, ?, ?, ?, ?, ?, ?)");
+    Statement event(db_, path_,
+                    "INSERT INTO events (job, sequence, kind, number, data, unix_ms) "
+                    "VALUES (?, ?, ?, ?, ?, ?)");
+    struct Numbers {
+      int64_t job = 0, last_event = 0;
+    };
+    std::map<JobId, Numbers> numbers;
+    const int64_t now = UnixMs();
+    for (const PendingTile* one : batch) {
+      auto at = numbers.find(one->job);
+      if (at == numbers.end()) {
+        Statement query(db_, path_,
+                        "SELECT j.number, IFNULL((SELECT MAX(sequence) FROM events "
+                        "WHERE job = j.number), 0) FROM jobs j WHERE j.id = ?");
+        FP_ASSIGN_OR_RETURN(const bool row, query.Text(one->job.value).Step());
+        if (!row) return Unknown(one->job);
+        at = numbers.emplace(one->job, Numbers{query.GetInt(0), query.GetInt(1)}).first;
+        Statement first(db_, path_,
+                        "UPDATE jobs SET fingerprint = ? WHERE number = ? AND fingerprint IS NULL");
+        FP_RETURN_IF_ERROR(first.Hash(one->fingerprint).Int(at->second.job).Run());
+      }
+      const Digest& sha256 = one->result.sha256;
+      insert.Reset()
+          .Int(at->second.job)
+          .Int(one->tile)
+          .Hash(sha256)
+          .Int(static_cast<int64_t>(one->result.bytes.size()))
+          .Bytes(ToWire(one->result.stats).SerializeAsString());
+      if (in_memory()) {
+        insert.Null().Null();
+      } else {
+        insert.Int(one->segment).Int(static_cast<int64_t>(one->offset));
+      }
+      FP_RETURN_IF_ERROR(insert.Text(one->worker).Run());
+      FP_RETURN_IF_ERROR(
+          event.Reset()
+              .Int(at->second.job)
+              .Int(++at->second.last_event)
+              .Int(kTileEvent)
+              .Int(one->tile)
+              .Bytes({reinterpret_cast<const char*>(sha256.bytes.data()), sha256.bytes.size()})
+              .Int(now)
+              .Run());
+    }
+    FP_RETURN_IF_ERROR(transaction.Commit());
+    if (in_memory()) {
+      for (const PendingTile* one : batch) tiles_[{one->job, one->tile}] = one->result.bytes;
+    }
+    return absl::OkStatus();
+  }
+
+  // `size` bytes of a file from `offset` on; kNotFound if it is shorter.
+  static absl::StatusOr<Blob> ReadPart(const std::string& path, uint64_t offset, uint64_t size) {
+    Descriptor file(::open(path.c_str(), O_RDONLY | O_CLOEXEC));
+    if (!file.valid()) return FileError("cannot open", path, errno);
+    struct stat info {};
+    if (::fstat(file.get(), &info) != 0) return FileError("cannot examine", path, errno);
+    const auto length = static_cast<uint64_t>(info.st_size);
+    if (offset > length || size > length - offset) {
+      return absl::NotFoundError("'" + path + "' is too short");
+    }
+    std::vector<std::byte> bytes(size);
+    uint64_t at = 0;
+    while (at < size) {
+      const ssize_t n =
+          ::pread(file.get(), bytes.data() + at, size - at, static_cast<off_t>(offset + at));
+      if (n < 0 && errno == EINTR) continue;
+      if (n <= 0) return FileError("cannot read", path, n == 0 ? EIO : errno);
+      at += static_cast<uint64_t>(n);
+    }
+    return Blob::FromVector(bytes);
+  }
+
+  // By the sizes of files alone.
+  absl::StatusOr<std::vector<uint32_t>> TilesWithoutBytes(const JobId& job) {
+    std::vector<uint32_t> missing;
+    if (in_memory()) return missing;
+    std::lock_guard lock(mutex_);
+    Statement query(db_, path_,
+                    "SELECT tile, size, segment, offset FROM tiles WHERE job = "
+                    "(SELECT number FROM jobs WHERE id = ?) ORDER BY tile");
+    query.Text(job.value);
+    std::map<int64_t, uint64_t> lengths;  // of segments
+    for (;;) {
+      FP_ASSIGN_OR_RETURN(const bool row, query.Step());
+      if (!row) return missing;
+      const auto tile = static_cast<uint32_t>(query.GetInt(0));
+      const auto size = static_cast<uint64_t>(query.GetInt(1));
+      std::error_code error;
+      if (query.IsNull(2)) {
+        const uint64_t length = fs::file_size(TilePath(job, tile), error);
+        if (error || length != size) missing.push_back(tile);
+        continue;
+      }
+      const auto [at, added] = lengths.emplace(query.GetInt(2), 0);
+      if (added) {
+        const uint64_t length = fs::file_size(SegmentPath(job, at->first), error);
+        if (!error) at->second = length;
+      }
+      const auto offset = static_cast<uint64_t>(query.GetInt(3));
+      if (offset > at->second || size > at->second - offset) missing.push_back(tile);
+    }
+  }
+
+  // Needs segments_mutex_ and mutex_.
   void RemoveTileBytes(const JobId& job) {
+    segments_.erase(job);
     if (in_memory()) {
       std::erase_if(tiles_, [&](const auto& entry) { return entry.first.first == job; });
     } else {
@@ -878,7 +1158,9 @@ class SqliteJobStore final : public JobStore {
                     "SELECT 1 FROM tiles WHERE tile = ? AND job = "
                     "(SELECT number FROM jobs WHERE id = ?)");
     FP_ASSIGN_OR_RETURN(const bool row, query.Int(tile).Text(job.value).Step());
-    if (!row) return absl::OkStatus();
+    return row ? CommittedAlready(job, tile) : absl::OkStatus();
+  }
+  static absl::Status CommittedAlready(const JobId& job, uint32_t tile) {
     return absl::AlreadyExistsError("tile " + std::to_string(tile) + " of job " + job.value +
                                     " is committed already");
   }
@@ -886,7 +1168,7 @@ class SqliteJobStore final : public JobStore {
   absl::StatusOr<std::vector<StoredTile>> TilesLocked(const JobId& job) {
     std::vector<StoredTile> tiles;
     Statement query(db_, path_,
-                    "SELECT tile, sha256, size FROM tiles WHERE job = "
+                    "SELECT tile, sha256, size, worker FROM tiles WHERE job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY tile");
     query.Text(job.value);
     for (;;) {
@@ -896,13 +1178,23 @@ class SqliteJobStore final : public JobStore {
       tile.tile = static_cast<uint32_t>(query.GetInt(0));
       FP_ASSIGN_OR_RETURN(tile.sha256, query.GetHash(1));
       tile.size_bytes = static_cast<uint64_t>(query.GetInt(2));
-      tiles.push_back(tile);
+      tile.worker = query.GetBytes(3);
+      tiles.push_back(std::move(tile));
     }
   }
 
   std::string directory_, path_;
+  StoreHook hook_;
   int lock_fd_ = -1;
   sqlite3* db_ = nullptr;
+
+  std::mutex queue_mutex_;
+  std::condition_variable batch_done_;
+  std::deque<PendingTile*> queue_;     // guarded by queue_mutex_
+  bool leading_ = false;               // somebody commits a batch; guarded by queue_mutex_
+  std::mutex segments_mutex_;          // before mutex_
+  std::map<JobId, Segment> segments_;  // guarded by segments_mutex_
+
   std::mutex mutex_;                                  // guards all below and db_
   std::map<std::pair<JobId, uint32_t>, Blob> tiles_;  // in memory only
   std::map<JobId, int64_t> log_lines_;                // how many a job has, once it is known
@@ -910,9 +1202,10 @@ class SqliteJobStore final : public JobStore {
 
 }  // namespace
 
-absl::StatusOr<std::unique_ptr<JobStore>> JobStore::Open(const std::string& directory) {
+absl::StatusOr<std::unique_ptr<JobStore>> JobStore::Open(const std::string& directory,
+                                                         StoreHook hook) {
   auto store = std::make_unique<SqliteJobStore>();
-  FP_RETURN_IF_ERROR(Annotate(store->Init(directory), "job store"));
+  FP_RETURN_IF_ERROR(Annotate(store->Init(directory, std::move(hook)), "job store"));
   return store;
 }
 

@@ -1,7 +1,12 @@
 // What the coordinator must not forget: jobs, committed tiles, events, bakes. SQLite in WAL mode
-// with synchronous=FULL, tile bytes as files beside it, or everything in memory. Each method that
+// with synchronous=FULL, tile bytes in files beside it, or everything in memory. Each method that
 // changes something returns when it is durable, and changes all or nothing, so that the process may
 // be killed at any instant.
+//
+// Tiles that are committed at the same time by several threads share one flush of their bytes and
+// one transaction: the more arrive, the more go into each. Their bytes are appended to segments,
+// files of one job, and a segment is written by one process only: what a killed process left
+// behind its last row is never read.
 //
 // Leases are not stored: a tile without a row is queued when the store is opened again. A store of
 // an older version is brought up to date when it is opened.
@@ -10,11 +15,13 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
 #include <set>
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -61,6 +68,7 @@ struct StoredTile {
   uint32_t tile = 0;
   Digest sha256;
   uint64_t size_bytes = 0;
+  std::string worker;  // name of who rendered it; may be empty
 };
 
 // Thread-seconds that a committed tile took, all stages together.
@@ -75,11 +83,16 @@ struct StoredEvent {
   int64_t unix_ms = 0;  // 0: written before events had a time
 };
 
+// For tests that kill the process or fail its disk there: called before and after everything that
+// reaches the disk, with the name of the place.
+using StoreHook = std::function<void(std::string_view point)>;
+
 class JobStore {
  public:
   // Files below `directory` (created if absent), which is locked against other processes. Empty: in
   // memory.
-  static absl::StatusOr<std::unique_ptr<JobStore>> Open(const std::string& directory);
+  static absl::StatusOr<std::unique_ptr<JobStore>> Open(const std::string& directory,
+                                                        StoreHook hook = {});
   virtual ~JobStore() = default;
 
   // --- Jobs ---
@@ -108,16 +121,18 @@ class JobStore {
 
   // --- Tiles ---
   // The bytes, the row, the event, and the job's fingerprint if it had none. kAlreadyExists if the
-  // tile is committed, kFailedPrecondition if the job has ended.
+  // tile is committed, kFailedPrecondition if the job has ended. `worker`: its name.
   virtual absl::Status CommitTile(const JobId& job, uint32_t tile, const TileResult& result,
-                                  const Digest& fingerprint) = 0;
+                                  const Digest& fingerprint, const std::string& worker = "") = 0;
   virtual absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) = 0;  // ascending
   // Added in tile order.
   virtual absl::StatusOr<Stats> TileStats(const JobId& job) = 0;
   // kNotFound if it is not committed; kDataLoss if its bytes are damaged.
   virtual absl::StatusOr<TileData> ReadTile(const JobId& job, uint32_t tile) = 0;
-  // Drops the tiles of an unfinished job whose bytes are missing or damaged; returns which.
-  virtual absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(const JobId& job) = 0;
+  // Drops the tiles of an unfinished job whose bytes are missing or damaged; returns which. Reads
+  // at most about `read_bytes`; beyond them only sizes are checked.
+  virtual absl::StatusOr<std::vector<uint32_t>> DropDamagedTiles(
+      const JobId& job, uint64_t read_bytes = UINT64_MAX) = 0;
   // It is as if they had never been committed.
   virtual absl::Status DropTiles(const JobId& job, const std::vector<uint32_t>& tiles) = 0;
   // The `count` committed tiles that took the longest, the longest first.

@@ -23,7 +23,10 @@ struct ServerFlags {
   std::string listen = "127.0.0.1:7447";
   std::string store, port_file, log_level = "info";
   unsigned threads = 0;
-  uint64_t silence_ms = 5000, lease_ms = 120000, heartbeat_ms = 1000, speculate_after_ms = 5000;
+  uint64_t silence_ms = 4000, lease_ms = 120000, heartbeat_ms = 1000, speculate_after_ms = 1000;
+  uint64_t reconnect_ms = 500, stall_ms = 3000;
+  double audit_fraction = 0.02;
+  std::string blob_dir;
   uint64_t retention_hours = 24 * 7, drain_seconds = 30;
   uint64_t max_blob_bytes = uint64_t{1} << 36;
   uint64_t bake_cache_mib = kDefaultBakeCacheBytes >> 20;
@@ -82,8 +85,20 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
   number("--heartbeat-ms", flags.heartbeat_ms, 10, "How often workers renew their leases");
   number("--silence-ms", flags.silence_ms, 50, "A lease is lost when its worker is silent so long");
   number("--lease-ms", flags.lease_ms, 100, "A lease is lost when its progress stops for so long");
+  number("--reconnect-ms", flags.reconnect_ms, 0,
+         "A lease is lost when the connection to its worker broke and stays broken so long");
+  number("--stall-ms", flags.stall_ms, 100,
+         "A lease is lost when its worker renders without progress or processor time so long");
   number("--speculate-after-ms", flags.speculate_after_ms, 1,
          "A slow tile is copied to an idle worker no sooner");
+  app.add_option("--audit-fraction", flags.audit_fraction,
+                 "Share of the tiles that another worker renders again in secret; 0: none")
+      ->check(CLI::Range(0.0, 1.0))
+      ->capture_default_str();
+  app.add_option(
+      "--blob-dir", flags.blob_dir,
+      "Folder for scenes and trees, which workers may read by their --blob-dir [blobs in "
+      "the store]");
   number("--drain-seconds", flags.drain_seconds, 0, "How long a stop waits for tiles in work");
   number("--retention-hours", flags.retention_hours, 1, "How long ended jobs are kept");
   app.add_option("--bake-cache-mib", flags.bake_cache_mib,
@@ -188,6 +203,10 @@ int Main(int argc, char** argv) {
   options.max_blob_bytes = flags.max_blob_bytes;
   options.heartbeat = std::chrono::milliseconds(flags.heartbeat_ms);
   options.silence_time = std::chrono::milliseconds(flags.silence_ms);
+  options.reconnect_time = std::chrono::milliseconds(flags.reconnect_ms);
+  options.stall_time = std::chrono::milliseconds(flags.stall_ms);
+  options.audit_fraction = flags.audit_fraction;
+  options.blob_directory = flags.blob_dir;
   options.lease_time = std::chrono::milliseconds(flags.lease_ms);
   options.speculate_after = std::chrono::milliseconds(flags.speculate_after_ms);
   options.retention = std::chrono::hours(flags.retention_hours);

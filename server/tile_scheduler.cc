@@ -1,7 +1,7 @@
 #include "server/tile_scheduler.h"
 
 #include <algorithm>
-#include <random>
+#include <iterator>
 
 #include "core/base/check.h"
 
@@ -11,6 +11,16 @@ namespace {
 
 constexpr size_t kRememberedLeases = 4096;
 constexpr size_t kRememberedDurations = 256;
+// Slowness is judged against a median of at least so many tiles.
+constexpr size_t kDurationsForSlowness = 4;
+// A worker so much slower than the one that asks gives up its tile to it.
+constexpr double kMuchSlower = 2;
+constexpr Duration kWorthCopying = std::chrono::milliseconds(200);
+// How long a vanished worker counts as a sign that the farm, not a tile, is at fault.
+constexpr Duration kStormWindow = std::chrono::minutes(10);
+constexpr size_t kStormFactor = 3;
+// A render thread that uses less than this part of one core does not compute.
+constexpr double kBusyFraction = 0.01;
 
 double Seconds(Duration d) { return std::chrono::duration<double>(d).count(); }
 
@@ -33,23 +43,46 @@ bool IsPermanent(absl::StatusCode code) {
 
 }  // namespace
 
+bool TileScheduler::Audit::HasOpinionOf(const WorkerId& worker) const {
+  return std::any_of(opinions.begin(), opinions.end(),
+                     [&](const auto& opinion) { return opinion.second.contains(worker); });
+}
+
+bool TileScheduler::Rank::operator<(const Rank& other) const {
+  if (priority != other.priority) return priority > other.priority;
+  if (number != other.number) return number < other.number;
+  return id < other.id;
+}
+
 TileScheduler::TileScheduler(const SchedulerOptions& options, const Clock& clock)
     : options_(options), clock_(clock) {
   std::random_device random;
   epoch_ = (uint64_t{random()} << 32) | random();
+  random_.seed(options.audit_seed != 0 ? options.audit_seed
+                                       : (uint64_t{random()} << 32) | random());
 }
 
 // --- Jobs ------------------------------------------------------------------------------------
 
 void TileScheduler::AddJob(const ScheduledJob& spec) {
   FP_CHECK(!jobs_.contains(spec.id));
+  FP_CHECK(spec.committed_by.empty() || spec.committed_by.size() == spec.committed.size());
   Job job;
   job.spec = spec;
+  job.spec.committed_by.clear();
   job.fingerprint = spec.fingerprint;
   job.tiles.resize(spec.tiles);
-  for (uint32_t tile : spec.committed) {
+  job.names.emplace_back();
+  std::map<std::string, uint32_t> names{{"", 0}};
+  for (size_t i = 0; i < spec.committed.size(); ++i) {
+    const uint32_t tile = spec.committed[i];
     FP_CHECK(tile < spec.tiles && job.tiles[tile].state == TileState::kQueued);
     job.tiles[tile].state = TileState::kCommitted;
+    if (spec.committed_by.empty()) continue;
+    const auto [name, added] =
+        names.emplace(spec.committed_by[i], static_cast<uint32_t>(job.names.size()));
+    if (added) job.names.push_back(name->first);
+    job.tiles[tile].committed_by = name->second;
   }
   for (uint32_t i = 0; i < spec.tiles; ++i) {
     job.tiles[i].open = spec.open;
@@ -61,17 +94,16 @@ void TileScheduler::AddJob(const ScheduledJob& spec) {
   job.counts.committed = static_cast<uint32_t>(spec.committed.size());
   job.counts.queued = spec.tiles - job.counts.committed;
   if (spec.paused) job.paused_at = clock_.Now();
-  jobs_.emplace(spec.id, std::move(job));
+  Rerank(jobs_.emplace(spec.id, std::move(job)).first->second);
 }
 
 void TileScheduler::RemoveJob(const JobId& id) {
   const auto at = jobs_.find(id);
   if (at == jobs_.end()) return;
-  std::vector<LeaseId> ending;
-  for (const auto& [lease, live] : leases_) {
-    if (live.grant.job == id) ending.push_back(lease);
-  }
+  const std::set<LeaseId> ending = at->second.leases;
   for (const LeaseId& lease : ending) EndLease(lease);
+  Unrank(at->second);
+  started_.erase(id);
   jobs_.erase(at);
 }
 
@@ -84,6 +116,7 @@ void TileScheduler::OpenTiles(const JobId& id, uint32_t first, uint32_t count) {
     job.tiles[tile].open = true;
     if (job.tiles[tile].state == TileState::kQueued) job.queued.insert(tile);
   }
+  Rerank(job);
 }
 
 void TileScheduler::SetPaused(const JobId& id, bool paused) {
@@ -94,24 +127,30 @@ void TileScheduler::SetPaused(const JobId& id, bool paused) {
   const TimePoint now = clock_.Now();
   if (paused) {
     job.paused_at = now;
-    return;
+  } else {
+    if (job.started) *job.started += now - std::max(*job.paused_at, *job.started);
+    job.paused_at.reset();
   }
-  if (job.started) *job.started += now - std::max(*job.paused_at, *job.started);
-  job.paused_at.reset();
+  Rerank(job);
 }
 
 void TileScheduler::SetPriority(const JobId& id, int32_t priority) {
   const auto at = jobs_.find(id);
-  if (at != jobs_.end()) at->second.spec.priority = priority;
+  if (at == jobs_.end()) return;
+  Unrank(at->second);
+  at->second.spec.priority = priority;
+  Rerank(at->second);
 }
 
 void TileScheduler::ForgetFailures(const JobId& id) {
   const auto at = jobs_.find(id);
   if (at == jobs_.end()) return;
   Job& job = at->second;
-  for (Tile& tile : job.tiles) {
+  for (uint32_t i = 0; i < job.tiles.size(); ++i) {
+    Tile& tile = job.tiles[i];
     tile.failures = 0;
     tile.dead.clear();
+    if (tile.state == TileState::kFailed) SetState(job, i, TileState::kQueued);
   }
   job.causes.clear();
 }
@@ -126,8 +165,9 @@ double TileScheduler::Progress(const JobId& id) const {
   if (at == jobs_.end() || at->second.counts.total == 0) return 0;
   const Job& job = at->second;
   double done = job.counts.committed;
-  for (const auto& [lease, live] : leases_) {
-    if (live.grant.job != id || live.grant.speculative) continue;
+  for (const LeaseId& lease : job.leases) {
+    const LiveLease& live = leases_.at(lease);
+    if (live.grant.speculative || live.grant.audit) continue;
     done += std::clamp<double>(live.progress.fraction, 0, 1);
   }
   return std::min(1.0, done / job.counts.total);
@@ -166,9 +206,13 @@ JobReport TileScheduler::Report(const JobId& id) const {
   const Job& job = at->second;
   report.leasable = static_cast<uint32_t>(job.queued.size());
   report.fingerprint = job.fingerprint;
+  report.audits_open = static_cast<uint32_t>(job.audits.size());
+  report.audits_done = job.audits_done;
+  report.audits_differ = job.audits_differ;
   const TimePoint now = clock_.Now();
-  for (const auto& [lease, live] : leases_) {
-    if (live.grant.job != id) continue;
+  for (const LeaseId& lease : job.leases) {
+    const LiveLease& live = leases_.at(lease);
+    if (live.grant.audit) continue;
     report.in_work.push_back({.grant = live.grant,
                               .worker_name = NameOfWorker(live.grant.worker),
                               .seconds = Seconds(now - live.started),
@@ -178,13 +222,37 @@ JobReport TileScheduler::Report(const JobId& id) const {
                    [](const TileInWork& a, const TileInWork& b) { return a.seconds > b.seconds; });
   for (const auto& [tile, cause] : job.causes) {
     const Tile& t = job.tiles[tile];
-    if (t.state == TileState::kCommitted) continue;
+    if (t.state == TileState::kCommitted || t.failures == 0) continue;
     report.troubled.push_back({.tile = tile,
                                .failures = t.failures,
                                .workers = static_cast<uint32_t>(t.dead.size()),
-                               .cause = cause});
+                               .cause = cause,
+                               .set_aside = t.state == TileState::kFailed});
   }
   return report;
+}
+
+AuditState TileScheduler::Audits(const JobId& id) const {
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return AuditState::kNone;
+  bool undecided = false;
+  for (const auto& [tile, audit] : at->second.audits) {
+    if (audit.lease || SomeWorkerCouldAudit(at->second, audit)) return AuditState::kOpen;
+    if (!audit.disputed_at) continue;
+    if (clock_.Now() - *audit.disputed_at < options_.decide_time) return AuditState::kOpen;
+    undecided = true;
+  }
+  return undecided ? AuditState::kUndecided : AuditState::kNone;
+}
+
+std::vector<uint32_t> TileScheduler::DisputedTiles(const JobId& id) const {
+  std::vector<uint32_t> tiles;
+  const auto at = jobs_.find(id);
+  if (at == jobs_.end()) return tiles;
+  for (const auto& [tile, audit] : at->second.audits) {
+    if (audit.disputed_at) tiles.push_back(tile);
+  }
+  return tiles;
 }
 
 void TileScheduler::SetState(Job& job, uint32_t tile, TileState state) {
@@ -202,12 +270,32 @@ void TileScheduler::SetState(Job& job, uint32_t tile, TileState state) {
     return job.counts.failed;
   };
   TileState& now = job.tiles[tile].state;
-  FP_CHECK(now != TileState::kCommitted);
   --count(now);
   ++count(state);
   if (now == TileState::kQueued) job.queued.erase(tile);
   if (state == TileState::kQueued && job.tiles[tile].open) job.queued.insert(tile);
   now = state;
+  Rerank(job);
+}
+
+void TileScheduler::Rerank(const Job& job) {
+  const Rank rank = RankOf(job);
+  const auto enter = [&rank](std::set<Rank>& ranks, bool in) {
+    if (in) {
+      ranks.insert(rank);
+    } else {
+      ranks.erase(rank);
+    }
+  };
+  const bool goes = !job.paused_at;
+  enter(ready_, goes && !job.queued.empty());
+  enter(working_, goes && !job.leases.empty());
+  enter(auditing_, goes && !job.audits.empty());
+}
+
+void TileScheduler::Unrank(const Job& job) {
+  const Rank rank = RankOf(job);
+  for (std::set<Rank>* ranks : {&ready_, &working_, &auditing_}) ranks->erase(rank);
 }
 
 // --- Workers ---------------------------------------------------------------------------------
@@ -220,11 +308,53 @@ void TileScheduler::AddWorker(const WorkerId& id, const WorkerHello& hello) {
   workers_.emplace(id, std::move(worker));
 }
 
+// A worker that vanished and is heard of again did not die of the tile that it had.
+void TileScheduler::Heard(const WorkerId& id, Worker& worker) {
+  worker.heard = clock_.Now();
+  if (worker.vanished_from.empty()) return;
+  for (const auto& [job_id, tile_index] : worker.vanished_from) {
+    std::erase_if(vanished_, [&](const Vanishing& v) {
+      return v.worker == id && v.job == job_id && v.tile == tile_index;
+    });
+    if (worker.failures > 0) --worker.failures;
+    if (worker.failures_in_a_row > 0) --worker.failures_in_a_row;
+    const auto job = jobs_.find(job_id);
+    if (job == jobs_.end()) continue;
+    Tile& tile = job->second.tiles[tile_index];
+    if (!tile.dead.contains(id)) continue;
+    tile.dead.erase(id);
+    if (tile.failures > 0) --tile.failures;
+    if (tile.state == TileState::kFailed && tile.dead.size() < options_.max_dead_workers &&
+        tile.failures < options_.max_tile_failures) {
+      SetState(job->second, tile_index, TileState::kQueued);
+    }
+  }
+  worker.vanished_from.clear();
+  if (!worker.convicted && worker.failures_in_a_row < options_.max_worker_failures) {
+    worker.set_aside_until.reset();
+  }
+}
+
 bool TileScheduler::Touch(const WorkerId& id) {
   const auto at = workers_.find(id);
   if (at == workers_.end()) return false;
-  at->second.heard = clock_.Now();
+  Heard(id, at->second);
   return true;
+}
+
+uint64_t TileScheduler::Connected(const WorkerId& id) {
+  const auto at = workers_.find(id);
+  if (at == workers_.end()) return 0;
+  at->second.connection = next_connection_++;
+  at->second.disconnected_at.reset();
+  Heard(id, at->second);
+  return at->second.connection;
+}
+
+void TileScheduler::Disconnected(const WorkerId& id, uint64_t connection) {
+  const auto at = workers_.find(id);
+  if (at == workers_.end() || at->second.connection != connection) return;
+  at->second.disconnected_at = clock_.Now();
 }
 
 void TileScheduler::RemoveWorker(const WorkerId& id) {
@@ -268,7 +398,17 @@ std::string TileScheduler::NameOfWorker(const WorkerId& id) const {
 }
 
 bool TileScheduler::IsSetAside(const Worker& worker) const {
-  return worker.set_aside_until && clock_.Now() < *worker.set_aside_until;
+  return worker.convicted || (worker.set_aside_until && clock_.Now() < *worker.set_aside_until);
+}
+
+// Neither silent nor cut off. One that was heard of after its connection broke is there.
+bool TileScheduler::IsThere(const Worker& worker) const {
+  if (worker.disconnected_at && worker.heard <= *worker.disconnected_at) return false;
+  return clock_.Now() - worker.heard < options_.silence_time;
+}
+
+bool TileScheduler::TakesFingerprint(const Job& job, const Worker& worker) const {
+  return job.fingerprint.empty() || job.fingerprint == worker.hello.fingerprint;
 }
 
 // --- Leases ----------------------------------------------------------------------------------
@@ -277,13 +417,21 @@ bool TileScheduler::AnotherWorkerCouldTake(const Job& job, const Tile& tile,
                                            const WorkerId& but) const {
   for (const auto& [id, worker] : workers_) {
     if (id == but || IsSetAside(worker) || tile.dead.contains(id)) continue;
-    if (!job.fingerprint.empty() && worker.hello.fingerprint != job.fingerprint) continue;
-    if (clock_.Now() - worker.heard < options_.silence_time) return true;
+    if (TakesFingerprint(job, worker) && IsThere(worker)) return true;
   }
   return false;
 }
 
-LeaseGrant TileScheduler::Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative) {
+bool TileScheduler::SomeWorkerCouldAudit(const Job& job, const Audit& audit) const {
+  for (const auto& [id, worker] : workers_) {
+    if (IsSetAside(worker) || audit.HasOpinionOf(id)) continue;
+    if (TakesFingerprint(job, worker) && IsThere(worker)) return true;
+  }
+  return false;
+}
+
+LeaseGrant TileScheduler::Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative,
+                                bool audit) {
   const TimePoint now = clock_.Now();
   LiveLease live;
   char name[48];
@@ -294,14 +442,25 @@ LeaseGrant TileScheduler::Grant(const WorkerId& worker, Job& job, uint32_t tile,
                 .job = job.spec.id,
                 .tile = tile,
                 .attempt = ++job.tiles[tile].attempts,
-                .speculative = speculative};
-  live.started = live.heard = live.progressed = now;
-  if (!job.started) job.started = now;
-  if (!speculative) SetState(job, tile, TileState::kLeased);
-  job.tiles[tile].leases.push_back(live.grant.lease);
-  workers_.at(worker).leases.insert(live.grant.lease);
+                .speculative = speculative,
+                .careful = job.tiles[tile].failures > 0,
+                .audit = audit};
+  live.started = live.heard = live.progressed = live.busy = now;
+  if (!job.started) {
+    job.started = now;
+    started_.insert(job.spec.id);
+  }
   const LeaseGrant grant = live.grant;
   leases_.emplace(grant.lease, std::move(live));
+  workers_.at(worker).leases.insert(grant.lease);
+  job.leases.insert(grant.lease);
+  if (audit) {
+    job.audits.at(tile).lease = grant.lease;
+  } else {
+    job.tiles[tile].leases.push_back(grant.lease);
+    if (!speculative) SetState(job, tile, TileState::kLeased);
+  }
+  Rerank(job);
   return grant;
 }
 
@@ -309,7 +468,7 @@ std::optional<LeaseGrant> TileScheduler::Lease(const WorkerId& id) {
   const auto at = workers_.find(id);
   if (at == workers_.end()) return std::nullopt;
   Worker& worker = at->second;
-  worker.heard = clock_.Now();
+  Heard(id, worker);
   // A worker has one tile at a time. If it asks while we think that it has one, the answer that
   // granted it was lost on its way.
   const std::set<LeaseId> unheard_of = worker.leases;
@@ -320,44 +479,57 @@ std::optional<LeaseGrant> TileScheduler::Lease(const WorkerId& id) {
   }
   if (IsSetAside(worker)) return std::nullopt;
 
-  std::vector<Job*> jobs;
-  for (auto& [job_id, job] : jobs_) {
-    if (job.paused_at) continue;
-    if (job.fingerprint.empty() || job.fingerprint == worker.hello.fingerprint) {
-      jobs.push_back(&job);
+  if (auto grant = LeaseAudit(id, worker)) return grant;
+  for (const Rank& rank : ready_) {
+    Job& job = jobs_.at(rank.id);
+    if (!TakesFingerprint(job, worker)) continue;
+    for (const uint32_t tile : job.queued) {
+      const Tile& candidate = job.tiles[tile];
+      if (candidate.dead.contains(id) && AnotherWorkerCouldTake(job, candidate, id)) continue;
+      return Grant(id, job, tile, false, false);
     }
   }
-  std::sort(jobs.begin(), jobs.end(), [](const Job* a, const Job* b) {
-    if (a->spec.priority != b->spec.priority) return a->spec.priority > b->spec.priority;
-    return a->spec.number < b->spec.number;
-  });
+  return LeaseCopy(id, worker);
+}
 
-  for (Job* job : jobs) {
-    for (uint32_t tile : job->queued) {
-      const Tile& candidate = job->tiles[tile];
-      if (candidate.dead.contains(id) && AnotherWorkerCouldTake(*job, candidate, id)) continue;
-      return Grant(id, *job, tile, false);
+std::optional<LeaseGrant> TileScheduler::LeaseAudit(const WorkerId& id, const Worker& worker) {
+  for (const Rank& rank : auditing_) {
+    Job& job = jobs_.at(rank.id);
+    if (!TakesFingerprint(job, worker)) continue;
+    for (const auto& [tile, audit] : job.audits) {
+      if (!audit.lease && !audit.HasOpinionOf(id)) return Grant(id, job, tile, false, true);
     }
   }
-  // Nothing is queued for this worker: copy the slowest tile, if it is slow.
-  for (Job* job : jobs) {
-    if (job->durations.empty()) continue;
-    std::vector<Duration> durations = job->durations;
-    const auto middle = durations.begin() + static_cast<ptrdiff_t>(durations.size() / 2);
-    std::nth_element(durations.begin(), middle, durations.end());
-    const Duration median = *middle;
+  return std::nullopt;
+}
+
+// Nothing is queued for this worker: the slowest tile, if it is slow, or is known to become so.
+std::optional<LeaseGrant> TileScheduler::LeaseCopy(const WorkerId& id, const Worker& worker) {
+  const TimePoint now = clock_.Now();
+  for (const Rank& rank : working_) {
+    Job& job = jobs_.at(rank.id);
+    if (!TakesFingerprint(job, worker) || job.durations.empty()) continue;
     const Duration slow =
         std::max(options_.speculate_after,
-                 std::chrono::duration_cast<Duration>(median * options_.speculate_factor));
+                 std::chrono::duration_cast<Duration>(job.median * options_.speculate_factor));
     const LiveLease* slowest = nullptr;
-    for (const auto& [lease, live] : leases_) {
-      if (live.grant.job != job->spec.id || live.grant.worker == id || live.committing) continue;
-      const Tile& tile = job->tiles[live.grant.tile];
+    for (const LeaseId& lease : job.leases) {
+      const LiveLease& live = leases_.at(lease);
+      if (live.grant.audit || live.grant.worker == id || live.committing) continue;
+      const Tile& tile = job.tiles[live.grant.tile];
       if (tile.leases.size() > 1 || tile.dead.contains(id)) continue;
-      if (clock_.Now() - live.started < slow) continue;
+      const Duration age = now - live.started;
+      const auto holder = workers_.find(live.grant.worker);
+      const double slowness = holder == workers_.end() ? 1 : holder->second.slowness;
+      const auto left = std::chrono::duration_cast<Duration>(job.median * slowness) - age;
+      const auto needed = std::chrono::duration_cast<Duration>(job.median * worker.slowness);
+      const bool known_slow = job.durations.size() >= kDurationsForSlowness &&
+                              slowness >= kMuchSlower * worker.slowness &&
+                              left > needed + kWorthCopying;
+      if (age < slow && !known_slow) continue;
       if (slowest == nullptr || live.started < slowest->started) slowest = &live;
     }
-    if (slowest != nullptr) return Grant(id, *job, slowest->grant.tile, true);
+    if (slowest != nullptr) return Grant(id, job, slowest->grant.tile, true, false);
   }
   return std::nullopt;
 }
@@ -370,11 +542,18 @@ RenewAnswer TileScheduler::Renew(const WorkerId& worker, const LeaseId& lease,
     return {.drop = true, .reason = "the lease has ended"};
   }
   LiveLease& live = at->second;
-  live.heard = clock_.Now();
-  if (progress.counter > live.progress.counter) {
-    live.progressed = live.heard;
-    live.progress = progress;
+  const TimePoint now = clock_.Now();
+  live.heard = now;
+  // Computing is a sign of life, though not progress: a block may take long.
+  const double used = std::chrono::duration<double>(progress.cpu - live.busy_cpu).count();
+  if (!progress.rendering || progress.cpu.count() == 0 ||
+      progress.counter > live.progress.counter ||
+      used >= kBusyFraction * Seconds(now - live.busy)) {
+    live.busy = now;
+    live.busy_cpu = progress.cpu;
   }
+  if (progress.counter > live.progress.counter) live.progressed = now;
+  if (progress.counter >= live.progress.counter) live.progress = progress;
   return {};
 }
 
@@ -399,6 +578,7 @@ absl::StatusOr<LeaseGrant> TileScheduler::BeginCommit(const WorkerId& worker, co
     return refuse(live.grant.job, "attempt " + std::to_string(attempt) + " is not the lease's " +
                                       std::to_string(live.grant.attempt));
   }
+  if (live.committing) return refuse(live.grant.job, "a result of this tile is being stored");
   Job& job = jobs_.at(live.grant.job);
   for (const LeaseId& other : job.tiles[live.grant.tile].leases) {
     if (leases_.at(other).committing) {
@@ -406,8 +586,7 @@ absl::StatusOr<LeaseGrant> TileScheduler::BeginCommit(const WorkerId& worker, co
     }
   }
   const auto by = workers_.find(worker);
-  if (by == workers_.end() ||
-      (!job.fingerprint.empty() && job.fingerprint != by->second.hello.fingerprint)) {
+  if (by == workers_.end() || !TakesFingerprint(job, by->second)) {
     return refuse(live.grant.job, "the job's tiles have another fingerprint");
   }
   // Two first tiles may be stored at a time: the one that came first decides.
@@ -416,52 +595,151 @@ absl::StatusOr<LeaseGrant> TileScheduler::BeginCommit(const WorkerId& worker, co
   return live.grant;
 }
 
-bool TileScheduler::FinishCommit(const LeaseId& lease, bool durable) {
-  const auto at = leases_.find(lease);
-  if (at == leases_.end()) return false;
-  const LiveLease live = at->second;
-  FP_CHECK(live.committing);
-  Job& job = jobs_.at(live.grant.job);
-  if (!durable) {
-    EndLease(lease);
-    ++job.reissued;
-    ForgetUnusedFingerprint(job);
-    return true;
-  }
-  const auto by = workers_.find(live.grant.worker);
-  if (by != workers_.end()) {
-    ++by->second.committed;
-    by->second.failures_in_a_row = 0;
-    by->second.set_aside_until.reset();
-  }
-  const Duration took = clock_.Now() - live.started;
+void TileScheduler::RememberDuration(Job& job, Duration took) {
   if (job.durations.size() < kRememberedDurations) {
     job.durations.push_back(took);
   } else {
     job.durations[job.committed_here % kRememberedDurations] = took;
   }
-  ++job.committed_here;
-  SetState(job, live.grant.tile, TileState::kCommitted);
-  const std::vector<LeaseId> ending = job.tiles[live.grant.tile].leases;
-  for (const LeaseId& one : ending) EndLease(one);
+  std::vector<Duration> durations = job.durations;
+  const auto middle = durations.begin() + static_cast<ptrdiff_t>(durations.size() / 2);
+  std::nth_element(durations.begin(), middle, durations.end());
+  job.median = *middle;
+}
 
-  // The first tile decides the job's fingerprint: others' leases cannot count any more.
-  std::vector<LeaseId> foreign;
-  for (const auto& [id, other] : leases_) {
-    if (other.grant.job != live.grant.job) continue;
-    const auto holder = workers_.find(other.grant.worker);
-    if (holder != workers_.end() && holder->second.hello.fingerprint != job.fingerprint) {
-      foreign.push_back(id);
+bool TileScheduler::FinishCommit(const LeaseId& lease, bool durable, const Digest& result) {
+  const auto at = leases_.find(lease);
+  if (at == leases_.end()) return false;
+  const LiveLease live = at->second;
+  FP_CHECK(live.committing && !live.grant.audit);
+  Job& job = jobs_.at(live.grant.job);
+  if (!durable || live.doomed) {
+    EndLease(lease);
+    ++job.reissued;
+    ForgetUnusedFingerprint(job);
+    return !live.doomed;
+  }
+  const Duration took = clock_.Now() - live.started;
+  const auto by = workers_.find(live.grant.worker);
+  if (by != workers_.end()) {
+    Worker& worker = by->second;
+    ++worker.committed;
+    worker.failures_in_a_row = 0;
+    worker.set_aside_until.reset();
+    if (job.durations.size() >= kDurationsForSlowness && job.median.count() > 0) {
+      const double ratio = Seconds(took) / Seconds(job.median);
+      worker.slowness = std::clamp((worker.slowness + ratio) / 2, 0.01, 1000.0);
     }
   }
-  for (const LeaseId& id : foreign) EndLease(id);
+  RememberDuration(job, took);
+  ++job.committed_here;
+  Tile& tile = job.tiles[live.grant.tile];
+  const std::string name = NameOfWorker(live.grant.worker);
+  const auto known = std::find(job.names.begin(), job.names.end(), name);
+  tile.committed_by = static_cast<uint32_t>(known - job.names.begin());
+  if (known == job.names.end()) job.names.push_back(name);
+  SetState(job, live.grant.tile, TileState::kCommitted);
+  const std::vector<LeaseId> ending = tile.leases;
+  for (const LeaseId& one : ending) EndLease(one);
+  if (options_.audit_fraction > 0 &&
+      std::uniform_real_distribution<double>(0, 1)(random_) < options_.audit_fraction) {
+    Audit audit;
+    audit.opinions[result].emplace(live.grant.worker, name);
+    job.audits[live.grant.tile] = std::move(audit);
+    Rerank(job);
+  }
+  if (job.counts.committed > 1) return true;
+
+  // The first tile decides the job's fingerprint: others' leases cannot count any more.
+  const std::set<LeaseId> leases = job.leases;
+  for (const LeaseId& id : leases) {
+    const auto holder = workers_.find(leases_.at(id).grant.worker);
+    if (holder != workers_.end() && holder->second.hello.fingerprint != job.fingerprint) {
+      EndLease(id);
+    }
+  }
   return true;
+}
+
+AuditVerdict TileScheduler::FinishAudit(const LeaseId& lease, const Digest& result) {
+  AuditVerdict verdict;
+  const auto at = leases_.find(lease);
+  if (at == leases_.end()) return verdict;
+  const LiveLease live = at->second;
+  FP_CHECK(live.committing && live.grant.audit);
+  EndLease(lease);
+  Job& job = jobs_.at(live.grant.job);
+  const auto found = job.audits.find(live.grant.tile);
+  if (live.doomed || found == job.audits.end()) return verdict;
+  verdict.counted = true;
+  Audit& audit = found->second;
+  audit.opinions[result].emplace(live.grant.worker, NameOfWorker(live.grant.worker));
+  if (const auto by = workers_.find(live.grant.worker); by != workers_.end()) {
+    ++by->second.committed;
+    by->second.failures_in_a_row = 0;
+  }
+  const auto agreed = std::find_if(audit.opinions.begin(), audit.opinions.end(),
+                                   [](const auto& opinion) { return opinion.second.size() >= 2; });
+  if (agreed == audit.opinions.end()) {
+    if (!audit.disputed_at) {
+      ++job.audits_differ;
+      audit.disputed_at = clock_.Now();
+    }
+    verdict.disputed = true;
+    return verdict;
+  }
+  ++job.audits_done;
+  std::map<WorkerId, std::string> wrong;
+  for (const auto& [digest, workers] : audit.opinions) {
+    if (digest != agreed->first) wrong.insert(workers.begin(), workers.end());
+  }
+  job.audits.erase(found);
+  Rerank(job);
+  for (const auto& [id, name] : wrong) Convict(id, name, verdict);
+  return verdict;
+}
+
+void TileScheduler::Convict(const WorkerId& id, const std::string& name, AuditVerdict& verdict) {
+  verdict.convicted.push_back({id, name});
+  if (const auto at = workers_.find(id); at != workers_.end()) {  // else it has left
+    at->second.convicted = true;
+    const std::set<LeaseId> ending = at->second.leases;
+    for (const LeaseId& lease : ending) {
+      LiveLease& live = leases_.at(lease);
+      if (live.committing) {
+        live.doomed = true;
+      } else {
+        EndLease(lease);
+      }
+    }
+  }
+  for (auto& [job_id, job] : jobs_) {
+    const auto known = std::find(job.names.begin(), job.names.end(), name);
+    if (known == job.names.end()) continue;
+    const auto index = static_cast<uint32_t>(known - job.names.begin());
+    for (uint32_t i = 0; i < job.tiles.size(); ++i) {
+      Tile& tile = job.tiles[i];
+      if (tile.state != TileState::kCommitted || tile.committed_by != index) continue;
+      if (const auto audit = job.audits.find(i); audit != job.audits.end()) {
+        const std::optional<LeaseId> lease = audit->second.lease;
+        if (lease && leases_.at(*lease).committing) {
+          leases_.at(*lease).doomed = true;
+        } else if (lease) {
+          EndLease(*lease);
+        }
+        job.audits.erase(i);
+      }
+      tile.committed_by = 0;
+      SetState(job, i, TileState::kQueued);
+      verdict.reopened[job_id].push_back(i);
+    }
+  }
 }
 
 void TileScheduler::ForgetUnusedFingerprint(Job& job) {
   if (job.counts.committed > 0) return;
-  for (const auto& [id, live] : leases_) {
-    if (live.grant.job == job.spec.id && live.committing) return;
+  for (const LeaseId& lease : job.leases) {
+    if (leases_.at(lease).committing) return;
   }
   job.fingerprint = {};
 }
@@ -484,45 +762,68 @@ void TileScheduler::EndLease(const LeaseId& lease) {
   const LeaseGrant grant = at->second.grant;
   leases_.erase(at);
   if (const auto worker = workers_.find(grant.worker); worker != workers_.end()) {
-    worker->second.leases.erase(lease);
+    worker->second.leases.erase(grant.lease);
   }
   Job& job = jobs_.at(grant.job);
-  Tile& tile = job.tiles[grant.tile];
-  std::erase(tile.leases, lease);
-  if (tile.leases.empty() && tile.state == TileState::kLeased) {
-    SetState(job, grant.tile, TileState::kQueued);
-  } else if (tile.leases.size() == 1) {
-    // The copy that is left is the tile's only attempt now: it may be copied again.
-    leases_.at(tile.leases.front()).grant.speculative = false;
+  job.leases.erase(grant.lease);
+  if (grant.audit) {
+    const auto audit = job.audits.find(grant.tile);
+    if (audit != job.audits.end() && audit->second.lease == grant.lease) {
+      audit->second.lease.reset();
+    }
+  } else {
+    Tile& tile = job.tiles[grant.tile];
+    std::erase(tile.leases, grant.lease);
+    if (tile.leases.empty() && tile.state == TileState::kLeased) {
+      SetState(job, grant.tile, TileState::kQueued);
+    } else if (tile.leases.size() == 1) {
+      // The copy that is left is the tile's only attempt now: it may be copied again.
+      leases_.at(tile.leases.front()).grant.speculative = false;
+    }
   }
+  Rerank(job);
   // A ring of the most recent ones.
   if (ended_order_.size() < kRememberedLeases) {
-    ended_order_.push_back(lease);
+    ended_order_.push_back(grant.lease);
   } else {
     ended_.erase(ended_order_[ended_next_]);
-    ended_order_[ended_next_] = lease;
+    ended_order_[ended_next_] = grant.lease;
     ended_next_ = (ended_next_ + 1) % kRememberedLeases;
   }
-  ended_[lease] = grant.job;
+  ended_[grant.lease] = grant.job;
 }
 
 void TileScheduler::FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile,
                             SchedulerNews& news) {
-  std::vector<LeaseId> ending;
-  for (const auto& [lease, live] : leases_) {
-    if (live.grant.job == job.spec.id) ending.push_back(lease);
-  }
+  const std::set<LeaseId> ending = job.leases;
   for (const LeaseId& lease : ending) EndLease(lease);
   for (uint32_t i = 0; i < job.tiles.size(); ++i) {
     if (job.tiles[i].state == TileState::kQueued) SetState(job, i, TileState::kFailed);
   }
+  job.audits.clear();
+  Rerank(job);
   news.failed.push_back({job.spec.id, std::move(error), tile});
 }
 
-void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, SchedulerNews& news) {
+bool TileScheduler::IsPoison(const Job& job, uint32_t index) {
+  const Tile& tile = job.tiles[index];
+  if (tile.failures >= options_.max_tile_failures) return true;
+  if (tile.dead.size() < options_.max_dead_workers) return false;
+  std::erase_if(vanished_,
+                [&](const Vanishing& v) { return clock_.Now() - v.when > kStormWindow; });
+  const size_t here = static_cast<size_t>(
+      std::count_if(vanished_.begin(), vanished_.end(),
+                    [&](const Vanishing& v) { return v.job == job.spec.id && v.tile == index; }));
+  if (tile.dead.size() >= options_.max_dead_workers + here) return true;  // without them, too
+  return vanished_.size() - here <= kStormFactor * here;
+}
+
+void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, Fault fault,
+                          SchedulerNews& news) {
   LostLease lost{.grant = grant, .reason = cause, .worker_name = NameOfWorker(grant.worker)};
-  if (const auto at = workers_.find(grant.worker); at != workers_.end()) {
-    Worker& worker = at->second;
+  const auto by = workers_.find(grant.worker);
+  if (by != workers_.end()) {
+    Worker& worker = by->second;
     ++worker.failures;
     if (++worker.failures_in_a_row >= options_.max_worker_failures) {
       worker.set_aside_until = clock_.Now() + options_.set_aside_time;
@@ -533,19 +834,24 @@ void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, Sch
   Job& job = jobs_.at(grant.job);
   Tile& tile = job.tiles[grant.tile];
   ++job.reissued;
+  // An audited tile has been rendered well once: whatever happens is not its fault.
   if (tile.state == TileState::kCommitted || tile.state == TileState::kFailed) return;
   ++tile.failures;
   tile.dead.insert(grant.worker);
   job.causes[grant.tile] = cause;
-  if (tile.dead.size() < options_.max_dead_workers && tile.failures < options_.max_tile_failures) {
-    return;
+  if (fault == Fault::kVanished) {
+    vanished_.push_back({clock_.Now(), grant.worker, grant.job, grant.tile});
+    if (by != workers_.end()) by->second.vanished_from.emplace_back(grant.job, grant.tile);
   }
-  FailJob(job,
-          absl::AbortedError("tile " + std::to_string(grant.tile) + " failed " +
-                             std::to_string(tile.failures) + " times on " +
-                             std::to_string(tile.dead.size()) + " workers; the last cause: " +
-                             cause + "; see the workers' logs, then requeue the job"),
-          grant.tile, news);
+  if (!IsPoison(job, grant.tile)) return;
+  const std::vector<LeaseId> ending = tile.leases;
+  for (const LeaseId& lease : ending) {
+    // A copy whose result is being stored may save the tile.
+    if (leases_.at(lease).committing) return;
+  }
+  for (const LeaseId& lease : ending) EndLease(lease);
+  SetState(job, grant.tile, TileState::kFailed);
+  news.set_aside.push_back({grant.job, grant.tile});
 }
 
 SchedulerNews TileScheduler::RefuseResult(const LeaseId& lease, const std::string& reason) {
@@ -556,7 +862,7 @@ SchedulerNews TileScheduler::RefuseResult(const LeaseId& lease, const std::strin
   ++jobs_.at(grant.job).refused;
   EndLease(lease);
   ForgetUnusedFingerprint(jobs_.at(grant.job));
-  Blame(grant, reason, news);
+  Blame(grant, reason, Fault::kReported, news);
   return news;
 }
 
@@ -575,12 +881,12 @@ SchedulerNews TileScheduler::ReportFailure(const WorkerId& worker, const LeaseId
     return news;
   }
   const std::string cause(error.message());
-  if (IsPermanent(error.code())) {
+  if (IsPermanent(error.code()) && !grant.audit) {
     FailJob(jobs_.at(grant.job), Annotate(error, "tile " + std::to_string(grant.tile)), grant.tile,
             news);
     return news;
   }
-  Blame(grant, cause, news);
+  Blame(grant, cause, Fault::kReported, news);
   return news;
 }
 
@@ -589,32 +895,57 @@ void TileScheduler::Forgive(Duration gap) {
   for (auto& [id, live] : leases_) {
     live.heard = std::min(now, live.heard + gap);
     live.progressed = std::min(now, live.progressed + gap);
+    live.busy = std::min(now, live.busy + gap);
   }
-  for (auto& [id, worker] : workers_) worker.heard = std::min(now, worker.heard + gap);
+  for (auto& [id, worker] : workers_) {
+    worker.heard = std::min(now, worker.heard + gap);
+    if (worker.disconnected_at) {
+      worker.disconnected_at = std::min(now, *worker.disconnected_at + gap);
+    }
+  }
 }
 
 SchedulerNews TileScheduler::Tick() {
   SchedulerNews news;
   const TimePoint now = clock_.Now();
-  std::vector<std::pair<LeaseGrant, std::string>> expired;
+  struct Expired {
+    LeaseGrant grant;
+    std::string reason;
+    Fault fault;
+  };
+  std::vector<Expired> expired;
   for (const auto& [id, live] : leases_) {
     if (live.committing) continue;
-    if (now - live.heard >= options_.silence_time) {
-      expired.emplace_back(live.grant,
-                           "nothing was heard of the worker for " + SecondsText(now - live.heard));
+    const auto expire = [&, &live = live](std::string reason, Fault fault) {
+      if (!live.progress.at.empty()) reason += "; the work was at " + live.progress.at;
+      expired.push_back({live.grant, std::move(reason), fault});
+    };
+    const auto holder = workers_.find(live.grant.worker);
+    const std::optional<TimePoint> broke =
+        holder == workers_.end() ? std::nullopt : holder->second.disconnected_at;
+    if (broke && holder->second.heard <= *broke && now - *broke >= options_.reconnect_time) {
+      expire("the connection to the worker broke", Fault::kVanished);
+    } else if (now - live.heard >= options_.silence_time) {
+      expire("nothing was heard of the worker for " + SecondsText(now - live.heard),
+             Fault::kVanished);
     } else if (now - live.progressed >=
                std::max(options_.lease_time, jobs_.at(live.grant.job).spec.lease_time)) {
-      expired.emplace_back(live.grant, "no progress for " + SecondsText(now - live.progressed));
+      expire("no progress for " + SecondsText(now - live.progressed), Fault::kReported);
+    } else if (live.progress.rendering && live.heard - live.busy >= options_.stall_time) {
+      expire("a render thread hangs: neither progress nor processor time for " +
+                 SecondsText(now - live.busy),
+             Fault::kReported);
     }
   }
-  for (const auto& [grant, reason] : expired) {
-    // A job that failed a moment ago took its leases with it.
-    if (!leases_.contains(grant.lease)) continue;
-    EndLease(grant.lease);
-    Blame(grant, reason, news);
+  for (const Expired& one : expired) {
+    // A tile that was set aside a moment ago took its leases with it.
+    if (!leases_.contains(one.grant.lease)) continue;
+    EndLease(one.grant.lease);
+    Blame(one.grant, one.reason, one.fault, news);
   }
-  for (auto& [id, job] : jobs_) {
-    if (!job.started || job.paused_at || job.counts.queued + job.counts.leased == 0) continue;
+  for (const JobId& id : started_) {
+    Job& job = jobs_.at(id);
+    if (job.paused_at || job.counts.queued + job.counts.leased == 0) continue;
     if (job.spec.max_time != Duration::max() && now - *job.started > job.spec.max_time) {
       FailJob(job,
               absl::ResourceExhaustedError("the job rendered longer than its limit of " +

@@ -5,19 +5,37 @@
 // has one, or two while a slow tile is copied to an idle worker. A lease lives until
 //   - its result is committed (then a second lease of the tile is told to drop it),
 //   - its worker reports failure, gives it back or leaves,
-//   - nothing was heard of its worker for silence_time, or progress stood still for lease_time,
+//   - nothing was heard of its worker for silence_time, or its connection broke and did not come
+//     back within reconnect_time,
+//   - progress stood still for lease_time, or, while it renders, neither progress was made nor a
+//     processor used for stall_time: a thread hangs,
 //   - its job ends, or its job commits a tile of another fingerprint.
 // A queued tile is leased only when it is open (its frame is baked) and its job is not paused.
 // Committing takes two steps, since a result counts when it is durable: BeginCommit pins the lease,
 // FinishCommit ends it. In between the tile counts as leased and no other result is taken.
+//
+// Poison. A tile that took down max_dead_workers different workers, or failed max_tile_failures
+// times, is set aside: it counts as failed, the job's other tiles go on, and the caller ends the
+// job when nothing else is left. Workers that just vanish may be a matter of the farm and not of
+// the tile: where more than three times as many vanished from other tiles lately, only
+// max_tile_failures counts. A worker that is heard of again did not die: what it was blamed for is
+// forgiven. A tile that failed before is leased as `careful`.
+//
+// Audits. A share audit_fraction of the committed tiles, drawn at random, is rendered again by
+// another worker, which cannot tell such a lease from others; the tile counts as committed all the
+// time. If the results differ, further workers are asked until two agree. Who returned something
+// else is set aside for good, and every tile that it committed, under any id of its name, is
+// queued again.
 #pragma once
 
 #include <chrono>
 #include <cstdint>
 #include <map>
 #include <optional>
+#include <random>
 #include <set>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "core/base/clock.h"
@@ -28,15 +46,21 @@
 namespace farpoint {
 
 struct SchedulerOptions {
-  Duration silence_time = std::chrono::seconds(5);
+  Duration silence_time = std::chrono::seconds(4);
   Duration lease_time = std::chrono::seconds(120);
+  Duration stall_time = std::chrono::seconds(3);
+  Duration reconnect_time = std::chrono::milliseconds(500);
   double speculate_factor = 3;
-  Duration speculate_after = std::chrono::seconds(5);
+  Duration speculate_after = std::chrono::seconds(1);
   uint32_t max_dead_workers = 3;
   uint32_t max_tile_failures = 6;
   uint32_t max_worker_failures = 3;
   Duration set_aside_time = std::chrono::seconds(60);
   Duration forget_worker_after = std::chrono::seconds(60);  // without leases and silent
+  double audit_fraction = 0;                                // [0, 1]
+  // How long a disagreement waits for a worker that may decide it.
+  Duration decide_time = std::chrono::seconds(60);
+  uint64_t audit_seed = 0;  // 0: random, so that nobody can tell which tiles
 };
 
 // The tiles of one job, as they are when rendering starts or is taken up again.
@@ -45,11 +69,12 @@ struct ScheduledJob {
   int32_t priority = 0;
   uint64_t number = 0;  // order of submission: age decides between equal priorities
   uint32_t tiles = 0;
-  std::vector<uint32_t> committed;      // tiles that are done already
-  Digest fingerprint;                   // of the committed tiles; empty if there are none
-  Duration max_time = Duration::max();  // from the first lease on
-  Duration lease_time{};                // if longer than the options' one
-  bool open = true;                     // false: no tile may be leased until OpenTiles names it
+  std::vector<uint32_t> committed;        // tiles that are done already
+  std::vector<std::string> committed_by;  // their workers' names; as many, or none: not known
+  Digest fingerprint;                     // of the committed tiles; empty if there are none
+  Duration max_time = Duration::max();    // from the first lease on
+  Duration lease_time{};                  // if longer than the options' one
+  bool open = true;                       // false: no tile may be leased until OpenTiles names it
   bool paused = false;
 };
 
@@ -60,6 +85,8 @@ struct LeaseGrant {
   uint32_t tile = 0;
   uint32_t attempt = 0;  // of the tile, from 1
   bool speculative = false;
+  bool careful = false;
+  bool audit = false;  // of a committed tile; the worker is not told
 };
 
 // What happened without anybody asking for it; for the log and for ending jobs.
@@ -74,10 +101,34 @@ struct FailedJob {
   absl::Status error;            // names tile and cause
   std::optional<uint32_t> tile;  // that the job failed by
 };
+struct SetAsideTile {
+  JobId job;
+  uint32_t tile = 0;
+};
 struct SchedulerNews {
   std::vector<LostLease> lost;
-  std::vector<FailedJob> failed;    // their tiles are failed, their leases gone
-  std::vector<WorkerId> forgotten;  // were silent too long
+  std::vector<FailedJob> failed;        // their tiles are failed, their leases gone
+  std::vector<SetAsideTile> set_aside;  // poison; Report tells why
+  std::vector<WorkerId> forgotten;      // were silent too long
+};
+
+// What an audit's result has shown.
+struct AuditVerdict {
+  bool counted = false;   // false: the lease has vanished meanwhile
+  bool disputed = false;  // results differ and no two agree: another worker is asked
+  struct Convict {
+    WorkerId id;
+    std::string name;
+  };
+  std::vector<Convict> convicted;  // they returned what two others did not
+  // Tiles that they had committed: queued again, to be dropped from the store before the caller
+  // lets go of its lock.
+  std::map<JobId, std::vector<uint32_t>> reopened;
+};
+enum class AuditState {
+  kNone,       // nothing to wait for
+  kOpen,       // a tile is rendered again, or will be
+  kUndecided,  // results differ, and nobody is there who could decide
 };
 
 // How the tiles of a job get on, for people.
@@ -92,12 +143,16 @@ struct TroubledTile {
   uint32_t failures = 0;
   uint32_t workers = 0;  // different ones that it failed on
   std::string cause;     // the last one
+  bool set_aside = false;
 };
 struct JobReport {
   uint32_t leasable = 0;               // queued and open tiles
   Digest fingerprint;                  // empty: any worker may take it
   std::vector<TileInWork> in_work;     // the longest first
   std::vector<TroubledTile> troubled;  // not committed, failed at least once; by tile
+  uint32_t audits_open = 0;
+  uint64_t audits_done = 0;    // two workers agreed
+  uint64_t audits_differ = 0;  // two workers disagreed
 };
 
 class TileScheduler {
@@ -115,7 +170,7 @@ class TileScheduler {
   // The time of a pause counts neither for max_time nor for the estimated rest.
   void SetPaused(const JobId& job, bool paused);
   void SetPriority(const JobId& job, int32_t priority);
-  // Its tiles count as if they had never failed, on any worker.
+  // Its tiles count as if they had never failed, on any worker; those set aside are queued again.
   void ForgetFailures(const JobId& job);
   // Zeros for an unknown job, as the next ones.
   TileCounts Counts(const JobId& job) const;
@@ -125,6 +180,9 @@ class TileScheduler {
   uint64_t Refused(const JobId& job) const;
   uint32_t Leasable(const JobId& job) const;  // queued and open tiles
   JobReport Report(const JobId& job) const;
+  AuditState Audits(const JobId& job) const;
+  // Committed tiles about which workers disagree.
+  std::vector<uint32_t> DisputedTiles(const JobId& job) const;
 
   // --- Workers ---
   void AddWorker(const WorkerId& id, const WorkerHello& hello);
@@ -133,6 +191,11 @@ class TileScheduler {
   bool Touch(const WorkerId& id);
   // Its leases are queued again, without blame.
   void RemoveWorker(const WorkerId& id);
+  // A connection that it keeps open for as long as it lives. A worker that never opened one is
+  // judged by its silence alone. Returns what Disconnected takes: only the end of the last
+  // connection counts. Unknown ids are ignored.
+  uint64_t Connected(const WorkerId& id);
+  void Disconnected(const WorkerId& id, uint64_t connection);
   std::vector<WorkerStatus> Workers() const;
   size_t worker_count() const { return workers_.size(); }
   // What it said of itself; null for an unknown one. Valid until workers are added or removed.
@@ -142,8 +205,9 @@ class TileScheduler {
   // --- Leases ---
   // The next tile for this worker: the job of highest priority, then the oldest, that takes its
   // fingerprint; a tile that it has not failed on before one that it has; else a copy of a slow
-  // tile. Nothing for unknown workers and those set aside. A worker has one lease at a time: one
-  // that it still has is taken for an answer that never reached it, and its tile is queued again.
+  // tile, or of one whose worker is known to be slow. Audits go before all. Nothing for unknown
+  // workers and those set aside. A worker has one lease at a time: one that it still has is taken
+  // for an answer that never reached it, and its tile is queued again.
   std::optional<LeaseGrant> Lease(const WorkerId& worker);
   RenewAnswer Renew(const WorkerId& worker, const LeaseId& lease, const LeaseProgress& progress);
   // The grant if the result may be taken; else kFailedPrecondition with the reason, and the
@@ -151,8 +215,12 @@ class TileScheduler {
   absl::StatusOr<LeaseGrant> BeginCommit(const WorkerId& worker, const LeaseId& lease,
                                          uint32_t attempt);
   // Ends what BeginCommit began. `durable`: the tile is committed, and all its leases end.
-  // Otherwise it is queued again. False if the lease vanished in between (its job was removed).
-  bool FinishCommit(const LeaseId& lease, bool durable);
+  // Otherwise it is queued again. False if the lease vanished in between (its job was removed) or
+  // its worker was convicted: then the tile is queued, and what was stored must be dropped.
+  // `result`: the hash of its bytes, which audits compare.
+  bool FinishCommit(const LeaseId& lease, bool durable, const Digest& result = {});
+  // The same for the lease of an audit, of which nothing is stored.
+  AuditVerdict FinishAudit(const LeaseId& lease, const Digest& result);
   // A worker's result was damaged: its lease ends, counted as its failure and as a refusal.
   SchedulerNews RefuseResult(const LeaseId& lease, const std::string& reason);
   SchedulerNews ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
@@ -169,26 +237,39 @@ class TileScheduler {
 
  private:
   enum class TileState : uint8_t { kQueued, kLeased, kCommitted, kFailed };
+  enum class Fault : uint8_t { kReported, kVanished };
   struct Tile {
     TileState state = TileState::kQueued;
     bool open = true;
     uint32_t attempts = 0;
     uint32_t failures = 0;
+    uint32_t committed_by = 0;    // index into Job::names
     std::set<WorkerId> dead;      // workers that it took down or that failed on it
-    std::vector<LeaseId> leases;  // at most two
+    std::vector<LeaseId> leases;  // at most two; no audits
+  };
+  struct Audit {
+    // Who returned what, with names; the committed result is among them.
+    std::map<Digest, std::map<WorkerId, std::string>> opinions;
+    std::optional<LeaseId> lease;
+    std::optional<TimePoint> disputed_at;
+    bool HasOpinionOf(const WorkerId& worker) const;
   };
   struct Job {
     ScheduledJob spec;
     std::vector<Tile> tiles;
     std::set<uint32_t> queued;  // open tiles in state kQueued, in order
+    std::set<LeaseId> leases;
     TileCounts counts;
     Digest fingerprint;
     std::optional<TimePoint> started;  // first lease
     uint32_t committed_here = 0;       // since it was added
     std::vector<Duration> durations;   // of the last committed tiles
+    Duration median{};                 // of durations
     std::optional<TimePoint> paused_at;
     std::map<uint32_t, std::string> causes;  // of the last failure of tiles
-    uint64_t reissued = 0, refused = 0;
+    std::vector<std::string> names;          // of workers that committed tiles; [0] is ""
+    std::map<uint32_t, Audit> audits;        // by tile, those that are not settled
+    uint64_t reissued = 0, refused = 0, audits_done = 0, audits_differ = 0;
   };
   struct Worker {
     WorkerHello hello;
@@ -196,38 +277,77 @@ class TileScheduler {
     std::set<LeaseId> leases;
     uint64_t committed = 0, failures = 0;
     uint32_t failures_in_a_row = 0;
+    double slowness = 1;  // of its tiles, as multiples of their jobs' medians
     std::optional<TimePoint> set_aside_until;
+    bool convicted = false;
+    uint64_t connection = 0;  // the last one
+    std::optional<TimePoint> disconnected_at;
+    std::vector<std::pair<JobId, uint32_t>> vanished_from;  // to be forgiven if it comes back
   };
   struct LiveLease {
     LeaseGrant grant;
-    TimePoint started, heard, progressed;
+    TimePoint started, heard, progressed, busy;
     LeaseProgress progress;
+    std::chrono::milliseconds busy_cpu{0};  // at `busy`
     bool committing = false;
+    bool doomed = false;  // its worker was convicted while it was committing
+  };
+  // Jobs in the order in which they are served.
+  struct Rank {
+    int32_t priority;
+    uint64_t number;
+    JobId id;
+    bool operator<(const Rank& other) const;
+  };
+  struct Vanishing {
+    TimePoint when;
+    WorkerId worker;
+    JobId job;
+    uint32_t tile;
   };
 
+  static Rank RankOf(const Job& job) { return {job.spec.priority, job.spec.number, job.spec.id}; }
+  // Enters the job among those that can be served, or takes it out. Call it after each change of
+  // queued, leases, audits and pause.
+  void Rerank(const Job& job);
+  void Unrank(const Job& job);
   bool IsSetAside(const Worker& worker) const;
+  bool IsThere(const Worker& worker) const;
+  bool TakesFingerprint(const Job& job, const Worker& worker) const;
   bool AnotherWorkerCouldTake(const Job& job, const Tile& tile, const WorkerId& but) const;
-  LeaseGrant Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative);
+  bool SomeWorkerCouldAudit(const Job& job, const Audit& audit) const;
+  LeaseGrant Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative, bool audit);
+  std::optional<LeaseGrant> LeaseAudit(const WorkerId& id, const Worker& worker);
+  std::optional<LeaseGrant> LeaseCopy(const WorkerId& id, const Worker& worker);
   // Takes the lease away from worker and tile; a tile without leases is queued again.
   void EndLease(const LeaseId& lease);
   std::string NameOfWorker(const WorkerId& id) const;
-  // Blames worker and tile for the loss of a lease, and tells of it; the job may fail by it.
-  void Blame(const LeaseGrant& grant, const std::string& cause, SchedulerNews& news);
+  void Heard(const WorkerId& id, Worker& worker);
+  // Blames worker and tile for the loss of a lease, and tells of it; the tile may be set aside.
+  void Blame(const LeaseGrant& grant, const std::string& cause, Fault fault, SchedulerNews& news);
+  bool IsPoison(const Job& job, uint32_t tile);
+  void Convict(const WorkerId& id, const std::string& name, AuditVerdict& verdict);
   // After a first result that did not become durable.
   void ForgetUnusedFingerprint(Job& job);
   void FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile, SchedulerNews& news);
   void SetState(Job& job, uint32_t tile, TileState state);
+  void RememberDuration(Job& job, Duration took);
 
   const SchedulerOptions options_;
   const Clock& clock_;
   std::map<JobId, Job> jobs_;
   std::map<WorkerId, Worker> workers_;
   std::map<LeaseId, LiveLease> leases_;
+  // Not paused, with leasable tiles; with leases; with unsettled audits.
+  std::set<Rank> ready_, working_, auditing_;
+  std::set<JobId> started_;          // whose time runs
+  std::vector<Vanishing> vanished_;  // lately, in order of time
+  std::mt19937_64 random_;           // which tiles are audited
   // Jobs of leases that ended, so that late results are counted: the most recent ones.
   std::map<LeaseId, JobId> ended_;
   std::vector<LeaseId> ended_order_;
   size_t ended_next_ = 0;
-  uint64_t next_lease_ = 1;
+  uint64_t next_lease_ = 1, next_connection_ = 1;
   uint64_t epoch_;  // makes lease ids of different processes different
 };
 

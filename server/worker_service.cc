@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <atomic>
 
 #include "proto/convert.h"
 #include "proto/farpoint.grpc.pb.h"
@@ -16,9 +17,49 @@ constexpr std::chrono::milliseconds kMaxLeaseWait{30000};
 // gone would have to time out.
 constexpr std::chrono::milliseconds kLeaseSlice{250};
 
-class WorkerServiceImpl final : public v1::WorkerService::Service {
+// The end of a worker's connection. Costs no thread while it lasts, of which there are as many as
+// workers.
+class Attendance final : public grpc::ServerWriteReactor<v1::AttendResponse> {
+ public:
+  Attendance(CoordinatorApi& coordinator, const WorkerId& worker)
+      : coordinator_(coordinator), worker_(worker) {
+    const absl::StatusOr<uint64_t> connection = coordinator_.Attached(worker_);
+    attached_ = connection.ok();
+    if (attached_) {
+      connection_ = *connection;
+      StartSendInitialMetadata();
+    } else {
+      End(ToGrpc(connection.status()));
+    }
+  }
+  void OnCancel() override {
+    if (attached_) coordinator_.Detached(worker_, connection_);
+    End(grpc::Status::CANCELLED);
+  }
+  void OnDone() override { delete this; }
+
+ private:
+  void End(const grpc::Status& status) {
+    if (!ended_.exchange(true)) Finish(status);
+  }
+
+  CoordinatorApi& coordinator_;
+  const WorkerId worker_;
+  bool attached_ = false;
+  uint64_t connection_ = 0;
+  std::atomic<bool> ended_ = false;
+};
+
+using WorkerServiceBase = v1::WorkerService::WithCallbackMethod_Attend<v1::WorkerService::Service>;
+
+class WorkerServiceImpl final : public WorkerServiceBase {
  public:
   explicit WorkerServiceImpl(CoordinatorApi& coordinator) : coordinator_(coordinator) {}
+
+  grpc::ServerWriteReactor<v1::AttendResponse>* Attend(grpc::CallbackServerContext*,
+                                                       const v1::AttendRequest* request) override {
+    return new Attendance(coordinator_, {request->worker_id()});
+  }
 
   grpc::Status Register(grpc::ServerContext* context, const v1::RegisterRequest* request,
                         v1::RegisterResponse* response) override {
@@ -63,9 +104,19 @@ class WorkerServiceImpl final : public v1::WorkerService::Service {
       if (!(request->fraction() >= 0 && request->fraction() <= 1)) {
         return absl::InvalidArgumentError("fraction is not within 0 to 1");
       }
+      if (request->at().size() > kMaxPlaceBytes) {
+        return absl::InvalidArgumentError("at is longer than " + std::to_string(kMaxPlaceBytes) +
+                                          " bytes");
+      }
+      constexpr uint64_t kMaxCpuMs = uint64_t{1} << 50;  // 35,000 years
       FP_ASSIGN_OR_RETURN(const RenewAnswer answer,
                           coordinator_.Renew({request->worker_id()}, {request->lease_id()},
-                                             {request->progress(), request->fraction()}));
+                                             {.counter = request->progress(),
+                                              .fraction = request->fraction(),
+                                              .at = request->at(),
+                                              .rendering = request->rendering(),
+                                              .cpu = std::chrono::milliseconds(static_cast<int64_t>(
+                                                  std::min(request->cpu_ms(), kMaxCpuMs)))}));
       response->set_drop(answer.drop);
       response->set_reason(answer.reason);
       return absl::OkStatus();

@@ -20,7 +20,43 @@ namespace fs = std::filesystem;
 
 namespace {
 
+// Tries without a byte in between before a transfer is given up, and the waits between them.
+constexpr int kIdleTries = 10;
+constexpr std::chrono::milliseconds kFirstWait{100};
+constexpr std::chrono::milliseconds kLastWait{1000};
+
 absl::Status Cancelled() { return absl::CancelledError("the tile was dropped"); }
+
+// Blobs that lie in a folder as files of their names.
+class FolderStreamer final : public BlobStreamer {
+ public:
+  explicit FolderStreamer(const std::string& directory) : directory_(directory) {}
+  absl::Status Stream(const Digest& digest, uint64_t offset_bytes, const Sink& sink) override {
+    const std::string path = directory_ + "/" + digest.Hex();
+    const Descriptor file(::open(path.c_str(), O_RDONLY | O_CLOEXEC));
+    if (!file.valid()) return FileError("cannot open", path, errno);
+    struct stat info {};
+    if (::fstat(file.get(), &info) != 0) return FileError("cannot examine", path, errno);
+    const auto size = static_cast<uint64_t>(info.st_size);
+    if (offset_bytes > size) return absl::OutOfRangeError("'" + path + "' is shorter");
+    std::vector<std::byte> buffer(kChunkBytes);
+    uint64_t at = offset_bytes;
+    do {
+      const size_t want = static_cast<size_t>(std::min<uint64_t>(buffer.size(), size - at));
+      const ssize_t n = ::pread(file.get(), buffer.data(), want, static_cast<off_t>(at));
+      if (n < 0 && errno == EINTR) continue;
+      if (n < 0 || (n == 0 && want > 0)) {
+        return FileError("cannot read", path, n == 0 ? EIO : errno);
+      }
+      FP_RETURN_IF_ERROR(sink(size, std::span(buffer.data(), static_cast<size_t>(n))));
+      at += static_cast<uint64_t>(n);
+    } while (at < size);
+    return absl::OkStatus();
+  }
+
+ private:
+  const std::string& directory_;
+};
 
 // Adds the file's first `size` bytes to `hash`.
 absl::Status HashStart(int fd, uint64_t size, const std::string& path, Sha256& hash) {
@@ -69,16 +105,52 @@ absl::StatusOr<Blob> BlobCache::FromFolder(const Digest& digest) {
 absl::StatusOr<Blob> BlobCache::Get(const Digest& digest, const std::function<bool()>& progress) {
   absl::StatusOr<Blob> blob = FromFolder(digest);
   if (blob.ok() || !absl::IsNotFound(blob.status())) return blob;
-  absl::Status fetched = Fetch(digest, progress);
-  // A part that an earlier process left may be damaged: once more, from the start.
-  if (absl::IsDataLoss(fetched)) fetched = Fetch(digest, progress);
-  FP_RETURN_IF_ERROR(fetched);
+  FP_RETURN_IF_ERROR(FetchFromAnywhere(digest, progress));
   blob = FromFolder(digest);
   Evict(digest);
   return blob;
 }
 
-absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>& progress) {
+absl::Status BlobCache::FetchFromAnywhere(const Digest& digest,
+                                          const std::function<bool()>& progress) {
+  if (!options_.shared_directory.empty()) {
+    FolderStreamer folder(options_.shared_directory);
+    uint64_t received = 0;
+    const absl::Status fetched = Fetch(digest, progress, folder, received);
+    if (fetched.ok() || absl::IsCancelled(fetched) || absl::IsResourceExhausted(fetched)) {
+      return fetched;
+    }
+    if (!absl::IsNotFound(fetched) && options_.warn) {
+      options_.warn(std::string(fetched.message()) + "; the coordinator is asked instead");
+    }
+  }
+  absl::Status fetched = FetchPatiently(digest, progress);
+  // A part that an earlier process left may be damaged: once more, from the start.
+  if (absl::IsDataLoss(fetched)) fetched = FetchPatiently(digest, progress);
+  return fetched;
+}
+
+absl::Status BlobCache::FetchPatiently(const Digest& digest,
+                                       const std::function<bool()>& progress) {
+  auto wait = kFirstWait;
+  for (int idle = 0;;) {
+    uint64_t received = 0;
+    const absl::Status fetched = Fetch(digest, progress, streamer_, received);
+    if (!absl::IsUnavailable(fetched) && !absl::IsDeadlineExceeded(fetched)) return fetched;
+    if (received > 0) {
+      idle = 0;
+      wait = kFirstWait;
+    } else if (++idle == kIdleTries) {
+      return fetched;
+    }
+    if (progress && !progress()) return Cancelled();
+    std::this_thread::sleep_for(wait);
+    wait = std::min(wait * 2, kLastWait);
+  }
+}
+
+absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>& progress,
+                              BlobStreamer& from, uint64_t& received) {
   const std::string path = PathOf(digest);
   const std::string part = path + ".part";
   Descriptor file;
@@ -111,7 +183,7 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
     ::unlink(part.c_str());
     return status;
   };
-  const absl::Status streamed = streamer_.Stream(
+  const absl::Status streamed = from.Stream(
       digest, have, [&](uint64_t size, std::span<const std::byte> data) -> absl::Status {
         if (progress && !progress()) return Cancelled();
         if (size > options_.max_blob_bytes) {
@@ -126,6 +198,7 @@ absl::Status BlobCache::Fetch(const Digest& digest, const std::function<bool()>&
         FP_RETURN_IF_ERROR(WriteAllAt(file.get(), have, data, part));
         hash.Update(data);
         have += data.size();
+        received += data.size();
         return absl::OkStatus();
       });
   if (!streamed.ok()) {

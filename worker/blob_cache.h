@@ -23,6 +23,10 @@ struct BlobCacheOptions {
   uint64_t max_blob_bytes = uint64_t{1} << 36;  // larger ones are refused before they are fetched
   // Told what the owner of the disk should know; may be empty. From any thread.
   std::function<void(const std::string&)> warn;
+  // A folder of blobs by their names that others fill, on a site's shared file system; blobs are
+  // copied from there, and asked of the coordinator only if they are not there or damaged. May be
+  // empty.
+  std::string shared_directory;
 };
 
 class BlobCache final : public BlobSource {
@@ -32,8 +36,9 @@ class BlobCache final : public BlobSource {
                                                          BlobStreamer& streamer);
 
   // From the folder if it is there and undamaged (its hash is checked when this process first uses
-  // it), else from the coordinator. Waits while another worker fetches the same blob. kDataLoss if
-  // what arrives has the wrong hash twice, kResourceExhausted if the disk is full.
+  // it), else from the shared folder, else from the coordinator. Waits while another worker fetches
+  // the same blob; an interrupted transfer is taken up again for some seconds after its last byte.
+  // kDataLoss if what arrives has the wrong hash twice, kUnavailable if the disk is full.
   absl::StatusOr<Blob> Get(const Digest& digest, const std::function<bool()>& progress) override;
 
  private:
@@ -41,7 +46,11 @@ class BlobCache final : public BlobSource {
       : options_(std::move(options)), streamer_(streamer) {}
   std::string PathOf(const Digest& digest) const { return options_.directory + "/" + digest.Hex(); }
   absl::StatusOr<Blob> FromFolder(const Digest& digest);
-  absl::Status Fetch(const Digest& digest, const std::function<bool()>& progress);
+  absl::Status FetchFromAnywhere(const Digest& digest, const std::function<bool()>& progress);
+  absl::Status FetchPatiently(const Digest& digest, const std::function<bool()>& progress);
+  // Once; `received` grows by the bytes that came.
+  absl::Status Fetch(const Digest& digest, const std::function<bool()>& progress,
+                     BlobStreamer& from, uint64_t& received);
   void Evict(const Digest& but);
 
   const BlobCacheOptions options_;

@@ -31,6 +31,9 @@ class CoordinatorLink {
   virtual absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                                      const absl::Status& error) = 0;
   virtual absl::Status Leave(const WorkerId& worker) = 0;
+  // From now on, until it leaves or the next one attends, the coordinator sees at once when this
+  // process is gone. Returns at once; nothing is done where calls do not cross processes.
+  virtual void Attend(const WorkerId& worker) { (void)worker; }
   // Ends a wait in Lease() soon, and those to come: kCancelled.
   virtual void CancelWaits() = 0;
 };

@@ -1,8 +1,11 @@
 #include "worker/grpc_link.h"
 
 #include <algorithm>
+#include <condition_variable>
+#include <cstring>
 #include <mutex>
 #include <set>
+#include <thread>
 
 #include "proto/convert.h"
 #include "proto/farpoint.grpc.pb.h"
@@ -17,6 +20,9 @@ constexpr std::chrono::milliseconds kCallTimeout{10000};
 constexpr std::chrono::milliseconds kRenewTimeout{3000};
 // Bulk transfers: a blob that takes longer is resumed, a tile returned again.
 constexpr std::chrono::milliseconds kStreamTimeout{600000};
+// Of one Attend; then it is opened again.
+constexpr std::chrono::milliseconds kAttendTimeout{3600000};
+constexpr std::chrono::milliseconds kAttendAgain{100};
 
 class GrpcLinkImpl final : public GrpcLink {
  public:
@@ -25,7 +31,17 @@ class GrpcLinkImpl final : public GrpcLink {
         address_(address),
         security_(security),
         workers_(v1::WorkerService::NewStub(channel_)),
-        blobs_(v1::BlobService::NewStub(channel_)) {}
+        blobs_(v1::BlobService::NewStub(channel_)),
+        attendant_([this] { AttendLoop(); }) {}
+  ~GrpcLinkImpl() override {
+    {
+      std::lock_guard lock(mutex_);
+      ending_ = true;
+      if (attending_ != nullptr) attending_->TryCancel();
+    }
+    attend_changed_.notify_all();
+    attendant_.join();
+  }
 
   absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) override {
     grpc::ClientContext context;
@@ -69,6 +85,9 @@ class GrpcLinkImpl final : public GrpcLink {
     request.set_lease_id(lease.value);
     request.set_progress(progress.counter);
     request.set_fraction(progress.fraction);
+    request.set_at(progress.at.substr(0, kMaxPlaceBytes));
+    request.set_rendering(progress.rendering);
+    request.set_cpu_ms(static_cast<uint64_t>(progress.cpu.count()));
     v1::RenewResponse response;
     FP_RETURN_IF_ERROR(FromGrpc(workers_->Renew(&context, request, &response)));
     return RenewAnswer{.drop = response.drop(), .reason = response.reason()};
@@ -116,7 +135,18 @@ class GrpcLinkImpl final : public GrpcLink {
     v1::LeaveRequest request;
     request.set_worker_id(worker.value);
     v1::LeaveResponse response;
-    return FromGrpc(workers_->Leave(&context, request, &response));
+    const grpc::Status left = workers_->Leave(&context, request, &response);
+    Attend({});
+    return FromGrpc(left);
+  }
+
+  void Attend(const WorkerId& worker) override {
+    {
+      std::lock_guard lock(mutex_);
+      attended_ = worker;
+      if (attending_ != nullptr) attending_->TryCancel();
+    }
+    attend_changed_.notify_all();
   }
 
   void CancelWaits() override {
@@ -138,10 +168,16 @@ class GrpcLinkImpl final : public GrpcLink {
     while (stream->Read(&chunk)) {
       if (first) size = chunk.size_bytes();
       first = false;
-      const absl::Status taken =
-          chunk.data().size() > kChunkBytes
-              ? absl::DataLossError("a chunk of " + std::to_string(chunk.data().size()) + " bytes")
-              : sink(size, std::as_bytes(std::span(chunk.data().data(), chunk.data().size())));
+      const std::span<const std::byte> data =
+          std::as_bytes(std::span(chunk.data().data(), chunk.data().size()));
+      absl::Status taken;
+      if (data.size() > kChunkBytes) {
+        taken = absl::DataLossError("a chunk of " + std::to_string(data.size()) + " bytes");
+      } else if (!HasHash(data, chunk.data_sha256())) {
+        taken = absl::UnavailableError("a chunk arrived damaged and is not used");
+      } else {
+        taken = sink(size, data);
+      }
       if (taken.ok()) continue;
       context.TryCancel();
       (void)stream->Finish();
@@ -151,6 +187,48 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
  private:
+  // A coordinator before data_sha256 sends none: the blob's own hash decides then.
+  static bool HasHash(std::span<const std::byte> data, const std::string& sha256) {
+    if (sha256.empty()) return true;
+    const Digest digest = HashBytes(data);
+    return sha256.size() == digest.bytes.size() &&
+           std::memcmp(sha256.data(), digest.bytes.data(), sha256.size()) == 0;
+  }
+
+  // Holds a stream open for attended_; it says nothing, its end says all.
+  void AttendLoop() {
+    std::unique_lock lock(mutex_);
+    while (!ending_) {
+      if (attended_.empty()) {
+        attend_changed_.wait(lock);
+        continue;
+      }
+      const WorkerId worker = attended_;
+      grpc::ClientContext context;
+      SetDeadline(context, kAttendTimeout);
+      context.set_wait_for_ready(true);
+      attending_ = &context;
+      lock.unlock();
+      v1::AttendRequest request;
+      request.set_worker_id(worker.value);
+      const auto stream = workers_->Attend(&context, request);
+      v1::AttendResponse nothing;
+      while (stream->Read(&nothing)) {
+      }
+      const grpc::Status status = stream->Finish();
+      lock.lock();
+      attending_ = nullptr;
+      if (ending_ || attended_ != worker) continue;
+      // Not known any more: Lease and Renew hear it too, and the worker registers again.
+      if (status.error_code() == grpc::StatusCode::NOT_FOUND ||
+          status.error_code() == grpc::StatusCode::UNIMPLEMENTED) {
+        attended_ = {};
+        continue;
+      }
+      attend_changed_.wait_for(lock, kAttendAgain);
+    }
+  }
+
   const std::shared_ptr<grpc::Channel> channel_;
   const std::string address_;
   const ChannelSecurity security_;
@@ -159,6 +237,11 @@ class GrpcLinkImpl final : public GrpcLink {
   std::mutex mutex_;
   bool cancelled_ = false;                // guarded by mutex_
   std::set<grpc::ClientContext*> waits_;  // guarded by mutex_
+  std::condition_variable attend_changed_;
+  bool ending_ = false;                       // guarded by mutex_
+  WorkerId attended_;                         // guarded by mutex_; empty: none
+  grpc::ClientContext* attending_ = nullptr;  // guarded by mutex_
+  std::thread attendant_;                     // the last member: it uses all others
 };
 
 }  // namespace

@@ -1,5 +1,6 @@
 // The worker's side of the wire: v1::WorkerService and v1::BlobService of a coordinator. Connects
-// in the background and again after a loss; every call has a deadline.
+// in the background and again after a loss; every call has a deadline. A chunk of a blob that does
+// not have its hash is dropped: kUnavailable, since the bytes before it are good.
 #pragma once
 
 #include <memory>

@@ -13,6 +13,7 @@
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 #include "worker/blob_cache.h"
+#include "worker/crash_reporter.h"
 #include "worker/fingerprint.h"
 #include "worker/grpc_link.h"
 #include "worker/tile_renderer.h"
@@ -24,7 +25,7 @@ namespace {
 constexpr const char* kProgram = "farpoint-worker";
 
 struct WorkerFlags {
-  std::string coordinator, cache, name, log_level = "info";
+  std::string coordinator, cache, blob_dir, name, log_level = "info";
   unsigned threads = 0;
   uint64_t cache_bytes = uint64_t{64} << 30;
   uint64_t cached_scenes = 2;
@@ -66,6 +67,9 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
   app.add_option("--tls-key", flags.tls.paths.key, "Its key");
   app.add_flag("--insecure", flags.tls.insecure,
                "Talk without TLS to a coordinator that is not on this machine");
+  app.add_option("--blob-dir", flags.blob_dir,
+                 "Folder of the site's shared file system with scenes and trees (the coordinator's "
+                 "--blob-dir): they are copied from there, not sent");
   app.add_option("--threads", flags.threads, "Threads; 0: all cores")->capture_default_str();
   app.add_option("--name", flags.name, "Shown by `farpoint status`")->capture_default_str();
   app.add_option("--cached-scenes", flags.cached_scenes, "Scenes kept in memory")
@@ -152,7 +156,8 @@ int Main(int argc, char** argv) {
   const absl::StatusOr<std::unique_ptr<BlobCache>> cache =
       BlobCache::Open({.directory = flags.cache,
                        .max_bytes = flags.cache_bytes,
-                       .warn = [](const std::string& text) { WriteLog(LogLevel::kWarning, text); }},
+                       .warn = [](const std::string& text) { WriteLog(LogLevel::kWarning, text); },
+                       .shared_directory = flags.blob_dir},
                       *link);
   if (!cache.ok()) return ReportFatal(kProgram, Annotate(cache.status(), "--cache"));
   const std::unique_ptr<TileRenderer> renderer = MakeCoreRenderer();
@@ -160,6 +165,7 @@ int Main(int argc, char** argv) {
   WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " for " +
                                 flags.coordinator + ", cache '" + flags.cache + "'");
 
+  const CrashReporter crashes([&](const std::string& cause) { worker.ReportCrash(cause); });
   std::atomic<bool> ended = false;
   std::thread stopper([&] {
     while (!ended.load()) {

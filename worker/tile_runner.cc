@@ -1,11 +1,22 @@
 #include "worker/tile_runner.h"
 
 #include <algorithm>
+#include <string>
 #include <utility>
+#include <vector>
 
 #include "core/base/clock.h"
 
 namespace farpoint {
+
+namespace {
+
+absl::StatusOr<TileOutput> Annotated(absl::StatusOr<TileOutput> output, const std::string& place) {
+  if (output.ok() || absl::IsCancelled(output.status())) return output;
+  return Annotate(output.status(), place);
+}
+
+}  // namespace
 
 TileRunner::TileRunner(const TileRenderer& renderer, BlobSource& blobs, Executor& executor,
                        size_t cached_scenes)
@@ -52,6 +63,29 @@ absl::StatusOr<std::shared_ptr<const RenderedScene>> TileRunner::SceneOf(
   return scene;
 }
 
+absl::StatusOr<TileOutput> TileRunner::RenderCarefully(const TileWork& work, TileProgress& progress,
+                                                       const std::atomic<bool>& cancel) {
+  TileOutput output;
+  output.film = Film(work.rect, work.frame.settings.layers);
+  const std::vector<PixelRect> blocks = BlocksOf(work.rect, work.frame.film.frame());
+  for (size_t i = 0; i < blocks.size(); ++i) {
+    const PixelRect block = blocks[i].Intersect(work.rect);
+    const std::string place = "block " + std::to_string(block.x0 / kBlockSize) + ", " +
+                              std::to_string(block.y0 / kBlockSize) + " (from pixel " +
+                              std::to_string(block.x0) + ", " + std::to_string(block.y0) + ")";
+    progress.MoveTo(place);
+    FP_ASSIGN_OR_RETURN(
+        const TileOutput part,
+        Annotated(frame_->RenderTile(
+                      block, executor_, [&](int, int) { progress.Advance(); }, &cancel),
+                  place));
+    output.film.Paste(part.film);
+    output.stats += part.stats;
+    progress.fraction = static_cast<float>(i + 1) / static_cast<float>(blocks.size());
+  }
+  return output;
+}
+
 absl::StatusOr<TileResult> TileRunner::Run(const TileWork& work, TileProgress& progress,
                                            const std::atomic<bool>& cancel) {
   Stats stats;
@@ -66,14 +100,14 @@ absl::StatusOr<TileResult> TileRunner::Run(const TileWork& work, TileProgress& p
     frame_blobs_ = work.blobs;
   }
   if (cancel.load()) return absl::CancelledError("the tile was dropped");
+  progress.rendering = true;
+  const auto on_block = [&](int done, int total) {
+    progress.fraction = total > 0 ? static_cast<float>(done) / total : 0.f;
+    progress.Advance();
+  };
   FP_ASSIGN_OR_RETURN(TileOutput output,
-                      frame_->RenderTile(
-                          work.rect, executor_,
-                          [&](int done, int total) {
-                            progress.fraction = total > 0 ? static_cast<float>(done) / total : 0.f;
-                            progress.Advance();
-                          },
-                          &cancel));
+                      work.careful ? RenderCarefully(work, progress, cancel)
+                                   : frame_->RenderTile(work.rect, executor_, on_block, &cancel));
   if (!(output.film.rect() == work.rect)) {
     return absl::InternalError("the renderer answered with another rectangle");
   }

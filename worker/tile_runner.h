@@ -4,8 +4,12 @@
 
 #include <atomic>
 #include <cstdint>
+#include <functional>
 #include <list>
 #include <memory>
+#include <mutex>
+#include <string>
+#include <utility>
 
 #include "core/base/executor.h"
 #include "core/base/status.h"
@@ -16,10 +20,30 @@
 namespace farpoint {
 
 // Written by the thread that renders, read by the one that sends heartbeats.
-struct TileProgress {
+class TileProgress {
+ public:
   std::atomic<uint64_t> counter{0};
   std::atomic<float> fraction{0};
+  std::atomic<bool> rendering{false};  // blobs and scene are there
+  // Tells the coordinator where the work is before it goes on there; set before Run, may be empty.
+  std::function<void()> tell;
+
   void Advance() { counter.fetch_add(1, std::memory_order_relaxed); }
+  void MoveTo(std::string place) {
+    {
+      std::lock_guard lock(mutex_);
+      place_ = std::move(place);
+    }
+    if (tell) tell();
+  }
+  std::string place() const {
+    std::lock_guard lock(mutex_);
+    return place_;
+  }
+
+ private:
+  mutable std::mutex mutex_;
+  std::string place_;  // guarded by mutex_
 };
 
 class TileRunner {
@@ -28,7 +52,8 @@ class TileRunner {
   TileRunner(const TileRenderer& renderer, BlobSource& blobs, Executor& executor,
              size_t cached_scenes);
 
-  // kCancelled soon after `cancel` is set. Advances `progress` with every piece of work.
+  // kCancelled soon after `cancel` is set. Advances `progress` with every piece of work. A careful
+  // tile is rendered block by block, with MoveTo before each: the same pixels.
   absl::StatusOr<TileResult> Run(const TileWork& work, TileProgress& progress,
                                  const std::atomic<bool>& cancel);
 
@@ -41,6 +66,9 @@ class TileRunner {
                                                                TileProgress& progress,
                                                                const std::atomic<bool>& cancel,
                                                                Stats& stats);
+
+  absl::StatusOr<TileOutput> RenderCarefully(const TileWork& work, TileProgress& progress,
+                                             const std::atomic<bool>& cancel);
 
   const TileRenderer& renderer_;
   BlobSource& blobs_;

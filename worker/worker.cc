@@ -7,6 +7,7 @@
 #include <random>
 #include <thread>
 
+#include "core/base/clock.h"
 #include "core/base/executor.h"
 #include "worker/tile_runner.h"
 
@@ -53,7 +54,11 @@ struct Worker::Impl {
     while (!Stopping()) {
       const absl::StatusOr<WorkerWelcome> answer = link.Register(hello);
       if (answer.ok()) {
-        welcome = *answer;
+        {
+          std::lock_guard lock(crash_mutex);
+          welcome = *answer;
+        }
+        link.Attend(welcome.id);
         Log(WorkerLogEntry::Level::kInfo, "registered as " + welcome.id.value);
         return absl::OkStatus();
       }
@@ -86,9 +91,50 @@ struct Worker::Impl {
     }
   }
 
+  // The tile in work, for as long as this lives.
+  class CurrentWork {
+   public:
+    CurrentWork(Impl& impl, const LeaseId& lease, const TileProgress& progress) : impl_(impl) {
+      std::lock_guard lock(impl_.crash_mutex);
+      impl_.current_lease = lease;
+      impl_.current_progress = &progress;
+    }
+    ~CurrentWork() {
+      std::lock_guard lock(impl_.crash_mutex);
+      impl_.current_progress = nullptr;
+    }
+    CurrentWork(const CurrentWork&) = delete;
+    CurrentWork& operator=(const CurrentWork&) = delete;
+
+   private:
+    Impl& impl_;
+  };
+
+  void ReportCrash(const std::string& cause) {
+    std::lock_guard lock(crash_mutex);
+    if (current_progress == nullptr) return;
+    const std::string place = current_progress->place();
+    (void)link.ReportFailure(
+        welcome.id, current_lease, false,
+        absl::AbortedError("the worker crashed" + (place.empty() ? "" : " in " + place) + ": " +
+                           cause));
+  }
+
   // One tile from lease to result. False if the coordinator does not know this worker any more.
   bool WorkOn(const TileWork& work) {
     TileProgress progress;
+    const auto renew = [&] {
+      return link.Renew(
+          welcome.id, work.lease,
+          {.counter = progress.counter.load(),
+           .fraction = progress.fraction.load(),
+           .at = progress.place(),
+           .rendering = progress.rendering.load(),
+           .cpu = std::chrono::milliseconds(static_cast<int64_t>(1000 * ProcessCpuSeconds()))});
+    };
+    // Whether it is heard or not, the work goes on: the heartbeat hears what is to be done.
+    progress.tell = [&] { (void)renew(); };
+    const CurrentWork current(*this, work.lease, progress);
     std::atomic<bool> cancel = false;
     bool known = true;      // by the coordinator; both written by the heartbeat, read after join
     std::string dropped;    // why the coordinator dropped the tile
@@ -112,8 +158,7 @@ struct Worker::Impl {
         }
         if (steady_clock::now() < next) continue;
         lock.unlock();
-        const absl::StatusOr<RenewAnswer> answer =
-            link.Renew(welcome.id, work.lease, {progress.counter.load(), progress.fraction.load()});
+        const absl::StatusOr<RenewAnswer> answer = renew();
         lock.lock();
         next = steady_clock::now() + welcome.heartbeat;
         if (answer.ok() && answer->drop) {
@@ -217,6 +262,11 @@ struct Worker::Impl {
   std::mt19937 jitter;
   std::chrono::milliseconds backoff{};
 
+  // For ReportCrash; never held while anything is computed.
+  std::mutex crash_mutex;
+  LeaseId current_lease;                           // guarded by crash_mutex
+  const TileProgress* current_progress = nullptr;  // guarded by crash_mutex; null: no tile
+
   std::mutex mutex;
   std::condition_variable changed;
   std::optional<steady_clock::time_point> stop_at;  // guarded by mutex
@@ -228,5 +278,6 @@ Worker::Worker(WorkerOptions options, CoordinatorLink& link, BlobSource& blobs,
 Worker::~Worker() = default;
 absl::Status Worker::Run() { return impl_->Run(); }
 void Worker::Stop() { impl_->Stop(); }
+void Worker::ReportCrash(const std::string& cause) { impl_->ReportCrash(cause); }
 
 }  // namespace farpoint

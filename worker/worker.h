@@ -30,7 +30,7 @@ struct WorkerOptions {
   size_t cached_scenes = 2;  // kept in memory, the one in use included; at least 1
   // Wait after a failed call: doubles from the first to the last, with jitter.
   std::chrono::milliseconds first_backoff{100};
-  std::chrono::milliseconds last_backoff{2000};
+  std::chrono::milliseconds last_backoff{1000};
   // How long Stop() lets the tile in work go on before it is given back.
   std::chrono::milliseconds drain_time{0};
   std::function<void(const WorkerLogEntry&)> log;  // may be empty; from any thread
@@ -51,6 +51,9 @@ class Worker {
   // The tile in work is finished within drain_time or given back; then Run() returns. From any
   // thread, more than once, before Run() too.
   void Stop();
+  // The process is about to die: tells the coordinator that the tile in work, if there is one,
+  // failed by `cause`. From a thread of its own (worker/crash_reporter.h).
+  void ReportCrash(const std::string& cause);
 
  private:
   struct Impl;

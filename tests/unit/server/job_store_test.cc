@@ -4,11 +4,15 @@
 #include <gtest/gtest.h>
 #include <signal.h>
 #include <sqlite3.h>
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
+#include <atomic>
 #include <filesystem>
 #include <fstream>
+#include <thread>
 
 #include "core/image/film.h"
 #include "proto/convert.h"
@@ -445,15 +449,209 @@ TEST(JobStore, DamagedAndMissingTilesAreDropped) {
           store->CommitTile(a.id, i, ResultOf("tile " + std::to_string(i)), DigestOf("f")).ok());
     }
   }
-  fs::remove(folder / "tiles/aaaaaaaa/1");
-  std::ofstream(folder / "tiles/aaaaaaaa/2") << "tile X";
-  fs::resize_file(folder / "tiles/aaaaaaaa/3", 3);
+  // Tiles of six bytes, one after the other.
+  const std::string segment = folder / "tiles/aaaaaaaa/segment.1";
+  ASSERT_EQ(fs::file_size(segment), 24u);
+  {
+    std::fstream file(segment, std::ios::in | std::ios::out | std::ios::binary);
+    file.seekp(6 + 5);
+    file << "X";
+  }
+  fs::resize_file(segment, 16);
   const auto store = OpenOrDie(folder.path());
+  EXPECT_TRUE(absl::IsDataLoss(store->ReadTile(a.id, 1).status()));
   EXPECT_TRUE(absl::IsDataLoss(store->ReadTile(a.id, 2).status()));
-  EXPECT_EQ(*store->DropDamagedTiles(a.id), (std::vector<uint32_t>{1, 2, 3}));
+  // Without reading, what is missing is found; reading finds what was changed, too.
+  EXPECT_EQ(*store->DropDamagedTiles(a.id, 0), (std::vector<uint32_t>{2, 3}));
+  EXPECT_EQ(*store->DropDamagedTiles(a.id), (std::vector<uint32_t>{1}));
   EXPECT_EQ(store->Tiles(a.id)->size(), 1u);
   EXPECT_TRUE(store->CommitTile(a.id, 2, ResultOf("tile 2"), DigestOf("f")).ok());
   EXPECT_TRUE(store->ReadTile(a.id, 2).ok());
+}
+
+// Up to schema 2 a tile was a file of its own.
+TEST(JobStore, TilesThatAreFilesOfTheirOwnAreRead) {
+  TempFolder folder;
+  StoredJob a = NewJob("aaaaaaaa");
+  {
+    const auto store = OpenOrDie(folder.path());
+    ASSERT_TRUE(store->InsertJob(a, "").ok());
+    ASSERT_TRUE(store->CommitTile(a.id, 0, ResultOf("zero"), DigestOf("f")).ok());
+    ASSERT_TRUE(store->CommitTile(a.id, 1, ResultOf("one"), DigestOf("f")).ok());
+  }
+  sqlite3* db = nullptr;
+  ASSERT_EQ(sqlite3_open((folder / "jobs.sqlite").c_str(), &db), SQLITE_OK);
+  ASSERT_EQ(
+      sqlite3_exec(db, "UPDATE tiles SET segment = NULL, offset = NULL", nullptr, nullptr, nullptr),
+      SQLITE_OK);
+  sqlite3_close(db);
+  std::ofstream(folder / "tiles/aaaaaaaa/0") << "zero";
+  const auto store = OpenOrDie(folder.path());
+  EXPECT_EQ(store->ReadTile(a.id, 0)->bytes.size(), 4u);
+  EXPECT_EQ(*store->DropDamagedTiles(a.id, 0), (std::vector<uint32_t>{1}));
+}
+
+TEST_P(JobStoreTest, TilesOfManyThreadsAreCommittedTogether) {
+  StoredJob a = NewJob("aaaaaaaa"), b = NewJob("bbbbbbbb");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  ASSERT_TRUE(store_->InsertJob(b, "").ok());
+  std::vector<std::thread> threads;
+  std::atomic<int> committed = 0, twice = 0;
+  for (uint32_t t = 0; t < 16; ++t) {
+    threads.emplace_back([&, t] {
+      for (uint32_t i = 0; i < 20; ++i) {
+        const JobId& job = (t + i) % 2 == 0 ? a.id : b.id;
+        // Each tile is tried by two threads.
+        const uint32_t tile = (t / 2) * 20 + i;
+        const absl::Status status = store_->CommitTile(
+            job, tile, ResultOf(job.value + std::to_string(tile)), DigestOf("f"), "worker");
+        committed += status.ok();
+        twice += absl::IsAlreadyExists(status);
+      }
+    });
+  }
+  for (std::thread& thread : threads) thread.join();
+  EXPECT_EQ(committed + twice, 320);
+  size_t tiles = 0;
+  for (const JobId& job : {a.id, b.id}) {
+    uint64_t sequence = 0;
+    const auto events = store_->Events(job, 0, 1000);
+    for (const StoredEvent& event : *events) EXPECT_EQ(event.sequence, ++sequence);
+    const auto stored = store_->Tiles(job);
+    for (const StoredTile& tile : *stored) {
+      ++tiles;
+      EXPECT_EQ(tile.worker, "worker");
+      const auto data = store_->ReadTile(job, tile.tile);
+      ASSERT_TRUE(data.ok()) << data.status();
+      EXPECT_EQ(data->sha256, DigestOf(job.value + std::to_string(tile.tile)));
+    }
+  }
+  EXPECT_EQ(tiles, static_cast<size_t>(committed));
+}
+
+// The process dies at every single place where something reaches the disk: whatever was
+// acknowledged before is there afterwards, and the store goes on.
+TEST(JobStore, SurvivesDeathAtEveryWritePoint) {
+  constexpr uint32_t kTiles = 3;
+  int points = 0;
+  for (int deadly = 1;; ++deadly) {
+    TempFolder folder;
+    int acknowledged[2];
+    ASSERT_EQ(::pipe(acknowledged), 0);
+    const pid_t child = ::fork();
+    if (child == 0) {
+      ::close(acknowledged[0]);
+      int passed = 0;
+      auto store = JobStore::Open(folder.path(), [&](std::string_view) {
+        if (++passed == deadly) ::kill(::getpid(), SIGKILL);
+      });
+      if (!store.ok()) ::_exit(1);
+      const auto tell = [&](char what) {
+        if (::write(acknowledged[1], &what, 1) != 1) ::_exit(2);
+      };
+      StoredJob job = NewJob("aaaaaaaa");
+      if (!(*store)->InsertJob(job, "s").ok()) ::_exit(3);
+      tell('j');
+      if (!(*store)->SetState(job.id, JobState::kBaking, absl::OkStatus()).ok()) ::_exit(4);
+      StoredFrame frame;
+      frame.blobs.prepared_scene = DigestOf("scene");
+      if (!(*store)->SetBaked(job.id, 0, frame, {"a note"}, {}).ok()) ::_exit(5);
+      tell('b');
+      for (uint32_t i = 0; i < kTiles; ++i) {
+        const TileResult result = ResultOf(std::string(1000, static_cast<char>('a' + i)));
+        if (!(*store)->CommitTile(job.id, i, result, DigestOf("f"), "w").ok()) ::_exit(6);
+        tell('t');
+      }
+      if (!(*store)->AppendLog(job.id, {.text = "a line"}).ok()) ::_exit(7);
+      if (!(*store)->SaveCounters(job.id, 1, 2).ok()) ::_exit(8);
+      if (!(*store)->SetState(job.id, JobState::kDone, absl::OkStatus()).ok()) ::_exit(9);
+      tell('d');
+      ::_exit(0);
+    }
+    ::close(acknowledged[1]);
+    std::string told;
+    char one = 0;
+    while (::read(acknowledged[0], &one, 1) == 1) told += one;
+    ::close(acknowledged[0]);
+    int status = 0;
+    ::waitpid(child, &status, 0);
+    const bool ended = WIFEXITED(status);
+    ASSERT_TRUE(!ended || WEXITSTATUS(status) == 0) << WEXITSTATUS(status);
+    if (!ended) ++points;
+
+    const auto store = OpenOrDie(folder.path());
+    ASSERT_NE(store, nullptr) << deadly;
+    const auto jobs = store->LoadJobs();
+    ASSERT_TRUE(jobs.ok()) << jobs.status();
+    const auto count = [&](char what) {
+      return static_cast<size_t>(std::count(told.begin(), told.end(), what));
+    };
+    ASSERT_GE(jobs->size(), count('j')) << deadly;
+    if (!jobs->empty()) {
+      const StoredJob& job = jobs->front();
+      EXPECT_GE(job.frames.size(), count('b')) << deadly;
+      EXPECT_THAT(*store->DropDamagedTiles(job.id), IsEmpty()) << deadly;
+      const size_t tiles = store->Tiles(job.id)->size();
+      EXPECT_GE(tiles, count('t')) << deadly;
+      EXPECT_LE(tiles, count('t') + 1) << deadly;
+      if (count('d') > 0) {
+        EXPECT_EQ(job.state, JobState::kDone);
+      }
+      if (!IsFinal(job.state)) {
+        for (auto i = static_cast<uint32_t>(tiles); i < kTiles; ++i) {
+          EXPECT_TRUE(store->CommitTile(job.id, i, ResultOf("again"), DigestOf("f")).ok());
+          EXPECT_TRUE(store->ReadTile(job.id, i).ok());
+        }
+      }
+    }
+    if (ended) break;
+  }
+  // Six transactions, three tiles' bytes, a line, a statement.
+  EXPECT_GE(points, 2 * 6 + 4 * 3 + 2 + 2);
+}
+
+TEST(JobStore, AFullDiskIsAClearErrorAndLosesNothing) {
+  TempFolder folder;
+  const pid_t child = ::fork();
+  if (child == 0) {
+    ::signal(SIGXFSZ, SIG_IGN);
+    auto store = JobStore::Open(folder.path());
+    StoredJob job = NewJob("aaaaaaaa");
+    if (!store.ok() || !(*store)->InsertJob(job, "s").ok()) ::_exit(1);
+    const TileResult small = ResultOf("pixels");
+    if (!(*store)->CommitTile(job.id, 0, small, DigestOf("f")).ok()) ::_exit(2);
+    rlimit limit{};
+    ::getrlimit(RLIMIT_FSIZE, &limit);
+    const rlim_t before = limit.rlim_cur;
+    limit.rlim_cur = 300000;
+    ::setrlimit(RLIMIT_FSIZE, &limit);
+    const absl::Status full =
+        (*store)->CommitTile(job.id, 1, ResultOf(std::string(1000000, 'x')), DigestOf("f"));
+    if (!absl::IsUnavailable(full)) ::_exit(3);
+    if (full.message().find(folder.path() + "/tiles/aaaaaaaa/segment.") == std::string::npos) {
+      ::_exit(4);
+    }
+    if (!(*store)->ReadTile(job.id, 0).ok()) ::_exit(5);
+    // The database itself cannot grow either: still an error, and the next commit works again.
+    bool refused = false;
+    for (uint32_t i = 10; i < 5000 && !refused; ++i) {
+      refused = !(*store)->CommitTile(job.id, i, small, DigestOf("f")).ok();
+    }
+    if (!refused) ::_exit(6);
+    limit.rlim_cur = before;
+    ::setrlimit(RLIMIT_FSIZE, &limit);
+    if (!(*store)->CommitTile(job.id, 2, small, DigestOf("f")).ok()) ::_exit(7);
+    ::_exit(0);
+  }
+  int status = 0;
+  ::waitpid(child, &status, 0);
+  ASSERT_TRUE(WIFEXITED(status));
+  ASSERT_EQ(WEXITSTATUS(status), 0);
+  const auto store = OpenOrDie(folder.path());
+  EXPECT_THAT(*store->DropDamagedTiles({"aaaaaaaa"}), IsEmpty());
+  EXPECT_TRUE(store->ReadTile({"aaaaaaaa"}, 0).ok());
+  EXPECT_TRUE(store->ReadTile({"aaaaaaaa"}, 2).ok());
+  EXPECT_TRUE(absl::IsNotFound(store->ReadTile({"aaaaaaaa"}, 1).status()));
 }
 
 // kill -9 at any instant: every tile that was acknowledged is there, whole.

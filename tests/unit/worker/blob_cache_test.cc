@@ -56,10 +56,12 @@ class FakeStreamer final : public BlobStreamer {
 
 class BlobCacheTest : public ::testing::Test {
  protected:
-  std::unique_ptr<BlobCache> Open(uint64_t max_bytes = 1 << 20, uint64_t max_blob = 1 << 20) {
-    auto cache = BlobCache::Open({folder_.path(), max_bytes, max_blob,
-                                  [this](const std::string& text) { warnings_.push_back(text); }},
-                                 streamer_);
+  std::unique_ptr<BlobCache> Open(uint64_t max_bytes = 1 << 20, uint64_t max_blob = 1 << 20,
+                                  const std::string& shared = "") {
+    auto cache =
+        BlobCache::Open({folder_.path(), max_bytes, max_blob,
+                         [this](const std::string& text) { warnings_.push_back(text); }, shared},
+                        streamer_);
     EXPECT_TRUE(cache.ok()) << cache.status();
     return *std::move(cache);
   }
@@ -87,10 +89,41 @@ TEST_F(BlobCacheTest, EmptyBlobsAreBlobs) {
 
 TEST_F(BlobCacheTest, AnInterruptedDownloadGoesOnInTheNextProcessToo) {
   const Digest digest = streamer_.Add(content_);
-  streamer_.break_at = 40;
-  EXPECT_TRUE(absl::IsUnavailable(Open()->Get(digest, {}).status()));
+  int calls = 0;
+  ASSERT_TRUE(absl::IsCancelled(Open()->Get(digest, [&] { return ++calls < 5; }).status()));
   EXPECT_EQ(TextOf(*Open()->Get(digest, {})), content_);
   EXPECT_EQ(streamer_.offsets, (std::vector<uint64_t>{0, 40}));
+}
+
+TEST_F(BlobCacheTest, AnInterruptedDownloadIsTakenUpAgain) {
+  const Digest digest = streamer_.Add(content_);
+  streamer_.break_at = 40;
+  EXPECT_EQ(TextOf(*Open()->Get(digest, {})), content_);
+  EXPECT_EQ(streamer_.offsets, (std::vector<uint64_t>{0, 40}));
+}
+
+TEST_F(BlobCacheTest, TheSharedFolderGoesBeforeTheCoordinator) {
+  TempFolder shared;
+  const Digest there = streamer_.Add(content_), damaged = streamer_.Add("12345678901234567890"),
+               missing = streamer_.Add("not in the folder"), empty = streamer_.Add("");
+  std::ofstream(shared / there.Hex()) << content_;
+  std::ofstream(shared / damaged.Hex()) << "1234567890XXX4567890";
+  std::ofstream(shared / empty.Hex());
+  auto cache = Open(1 << 20, 1 << 20, shared.path());
+  EXPECT_EQ(TextOf(*cache->Get(there, {})), content_);
+  EXPECT_EQ(cache->Get(empty, {})->size(), 0u);
+  EXPECT_TRUE(streamer_.offsets.empty()) << "the coordinator was asked";
+  // What was copied stays when the folder goes.
+  std::filesystem::remove(shared / there.Hex());
+  EXPECT_EQ(TextOf(*Open(1 << 20, 1 << 20, shared.path())->Get(there, {})), content_);
+  EXPECT_TRUE(streamer_.offsets.empty());
+
+  EXPECT_EQ(TextOf(*cache->Get(damaged, {})), "12345678901234567890");
+  ASSERT_EQ(warnings_.size(), 1u);
+  EXPECT_NE(warnings_[0].find("other contents"), std::string::npos) << warnings_[0];
+  EXPECT_EQ(TextOf(*cache->Get(missing, {})), "not in the folder");
+  EXPECT_EQ(warnings_.size(), 1u);
+  EXPECT_EQ(streamer_.offsets, (std::vector<uint64_t>{0, 0}));
 }
 
 TEST_F(BlobCacheTest, ADamagedPartIsThrownAwayAndFetchedAgain) {
