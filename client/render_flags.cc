@@ -357,7 +357,7 @@ constexpr RenderFlag kRenderFlags[] = {
      ApplyFps},
     {"--aov", "LIST", kImage,
      "more layers besides the default ones, with commas: irradiance, direct_irradiance, …; 'none' "
-     "in front leaves the default ones out",
+     "in front leaves the default ones out, but for the image itself",
      ApplyLayers},
     {"--seed", "N", kImage, "seed of every random choice; default 0",
      [](std::string_view value, JobEdit& edit) {

@@ -352,9 +352,23 @@ void LightSampler::Weigh(const PunctualBlock& block, const Vec3f& p, const Vec3f
   Store8(weights.data(), Select8(d2 > zero, Min8(Max8(weight, zero), Set8(1e30f)), zero));
 }
 
+void LightSampler::Skip(const Query& q, const Vec3f& direction, float reach_m,
+                        LightCounters& counters) const {
+  if ((q.needless & kNeedlessRays) == 0) {
+    ++counters.skipped_facing_away;
+    return;
+  }
+  ++counters.needless;
+  // Emitters that are seen edge-on have no direction.
+  const float length2 = Length2(direction);
+  if (reach_m > 0.0f && length2 > 0.9f && length2 < 1.1f) {
+    (void)accel_->Occluded(q.origin, direction, reach_m);
+  }
+}
+
 void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64_t key,
                                   unsigned dimension, std::span<V8> irradiance,
-                                  LightCounters& counters) const {
+                                  LightCounters& counters, unsigned needless) const {
   const auto for_each_lane = [&](size_t i, const auto& from) {
     for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
       const auto k = static_cast<size_t>(std::countr_zero(rest));
@@ -363,6 +377,18 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
       irradiance[i].SetLane(k, irradiance[i].Lane(k) + from(q));
     }
   };
+  if (needless != 0) {
+    for (size_t i = 0; i < points.size(); ++i) {
+      irradiance[i] = V8(Vec3f());
+      for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
+        const auto k = static_cast<size_t>(std::countr_zero(rest));
+        irradiance[i].SetLane(
+            k, Irradiance(points[i].p.Lane(k), points[i].ng.Lane(k), points[i].n.Lane(k), 1, key,
+                          points[i].index[k], dimension, counters, false, true, needless));
+      }
+    }
+    return;
+  }
   const bool any_punctual = !directional_lights_.empty() || !positioned_lights_.empty();
   for (size_t i = 0; i < points.size(); ++i) {
     irradiance[i] = V8(Vec3f());
@@ -388,7 +414,12 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
       }
     }
   }
-  if (!has_sky_) return;
+  if (!has_sky_) {
+    for (const SurfacePoints8& p : points) {
+      counters.skipped_environments += static_cast<uint32_t>(std::popcount(p.active));
+    }
+    return;
+  }
   for (size_t i = 0; i < points.size(); ++i) {
     for_each_lane(i, [&](const Query& q) {
       return environment_ != nullptr ? FromMap(q, counters) : FromSky(q, counters);
@@ -398,8 +429,10 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
 
 Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
                              uint64_t key, uint32_t first_index, unsigned dimension,
-                             LightCounters& counters, bool refine, bool environment) const {
-  const Query q{p, ng, n, accel_->LeaveSurface(p, ng), samples, key, first_index, dimension};
+                             LightCounters& counters, bool refine, bool environment,
+                             unsigned needless) const {
+  const Query q{p,           ng,        n,       accel_->LeaveSurface(p, ng), samples, key,
+                first_index, dimension, needless};
   Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
     irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
@@ -409,6 +442,14 @@ Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, ui
     irradiance += Refined(&LightSampler::FromMap, q, refine, counters);
   } else if (has_sky_) {
     irradiance += Refined(&LightSampler::FromSky, q, refine, counters);
+  } else if ((needless & kNeedlessEnvironment) != 0) {
+    // A black one.
+    LightCounters black;
+    irradiance += FromSky(q, black);
+    counters.needless += black.rays + black.needless;
+    counters.skipped_facing_away += black.skipped_facing_away;
+  } else {
+    ++counters.skipped_environments;
   }
   return irradiance;
 }
@@ -486,7 +527,7 @@ Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
   const float cosine = Dot(q.n, to_light);
   if (!(cosine > 0.0f) || !(Dot(q.ng, to_light) > 0.0f) || !(MaxComponent(arriving) > 0.0f) ||
       !IsFinite(arriving)) {
-    ++counters.skipped_facing_away;
+    Skip(q, to_light, d_m, counters);
     return {};
   }
   ++counters.rays;
@@ -590,7 +631,10 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
     }
     ShadowRays8 rays = RaysTo(samples);
     counters.samples += count;
-    counters.skipped_facing_away += count - static_cast<uint32_t>(std::popcount(rays.active));
+    for (unsigned rest = ((1u << count) - 1u) & ~rays.active; rest != 0; rest &= rest - 1) {
+      const auto k = static_cast<size_t>(std::countr_zero(rest));
+      Skip(q, rays.direction[k], rays.reach_m[k], counters);
+    }
     Trace(rays, counters);
     for (uint32_t k = 0; k < count; ++k) sum += rays.arriving.Lane(k);
   }
@@ -701,7 +745,10 @@ Rgb LightSampler::FromSky(const Query& q, LightCounters& counters) const {
     const Vec3f w =
         frame.ToWorld(CosineHemisphere(OwenSobol(q.first_index + i, q.dimension, seed),
                                        OwenSobol(q.first_index + i, q.dimension + 1, seed)));
-    if (!(Dot(q.ng, w) > 0.0f)) continue;
+    if (!(Dot(q.ng, w) > 0.0f)) {
+      Skip(q, w, std::numeric_limits<float>::infinity(), counters);
+      continue;
+    }
     ++counters.rays;
     if (accel_->Occluded(q.origin, w)) {
       ++counters.blocked;
@@ -723,7 +770,7 @@ Rgb LightSampler::FromMap(const Query& q, LightCounters& counters) const {
         environment_->Sample(view, OwenSobolBits(q.first_index + i, q.dimension, seed) * 0x1p-32,
                              OwenSobolBits(q.first_index + i, q.dimension + 1, seed) * 0x1p-32);
     if (!draw || !(Dot(q.ng, draw->direction) > 0.0f)) {
-      ++counters.skipped_facing_away;
+      Skip(q, draw ? draw->direction : Vec3f(), std::numeric_limits<float>::infinity(), counters);
       continue;
     }
     ++counters.rays;

@@ -29,6 +29,9 @@ struct LightCounters {
   uint64_t samples = 0;              // lights, points on emitters, directions of the map drawn
   uint64_t skipped_facing_away = 0;  // nothing arrives unshadowed: behind the surface, out of range
                                      // or cone, seen edge-on, or a hole
+  uint64_t skipped_environments = 0;  // estimates of a scene without an environment
+  uint64_t skipped_black = 0;         // paths that ended on what reflects nothing
+  uint64_t needless = 0;              // rays that could not matter, traced all the same
 };
 
 // Eight surface points side by side, such as the hits of eight paths. Lanes that are not active
@@ -37,6 +40,12 @@ struct SurfacePoints8 {
   V8 p, ng, n;      // as LightSampler::Irradiance takes them
   U8 index;         // of the sample within its sequence
   unsigned active;  // bit k: lane k
+};
+
+// What an estimate computes although it cannot matter; values of a mask.
+enum NeedlessLight : unsigned {
+  kNeedlessRays = 1u << 0,         // shadow rays of lights that cannot reach
+  kNeedlessEnvironment = 1u << 1,  // rays to an environment that is not there
 };
 
 // Immutable; thread-safe.
@@ -73,16 +82,18 @@ class LightSampler {
   // are not. What decides is independent of what it decides about, so this too is unbiased. Not
   // below kFewestRefined samples. Index ranges of one key are then sets of their own.
   // `environment`: false: without what comes from there.
+  // `needless`: NeedlessLight; the estimate is the same, bit by bit.
   Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
                  uint32_t first_index, unsigned dimension, LightCounters& counters,
-                 bool refine = false, bool environment = true) const;
+                 bool refine = false, bool environment = true, unsigned needless = 0) const;
 
   static constexpr uint32_t kRefined = 16, kFewestRefined = 4;
 
   // Irradiance(p, ng, n, 1, key, index, dimension, counters) of each active lane, to the same bits,
   // in less than half the time without rays; 0 in the others. `irradiance` is as long as `points`.
   void IrradianceEach(std::span<const SurfacePoints8> points, uint64_t key, unsigned dimension,
-                      std::span<V8> irradiance, LightCounters& counters) const;
+                      std::span<V8> irradiance, LightCounters& counters,
+                      unsigned needless = 0) const;
 
  private:
   // What an estimate is made for.
@@ -93,7 +104,10 @@ class LightSampler {
     uint64_t key;
     uint32_t first_index;
     unsigned dimension;
+    unsigned needless = 0;
   };
+  // A ray that cannot matter: counted, or traced for nothing.
+  void Skip(const Query& q, const Vec3f& direction, float reach_m, LightCounters& counters) const;
   // Of one of the From… below: its estimate, and in a penumbra a finer one.
   Rgb Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const, const Query& q,
               bool refine, LightCounters& counters) const;

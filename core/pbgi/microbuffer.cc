@@ -12,23 +12,6 @@ namespace farpoint {
 
 namespace {
 
-// A surfel wider than this many pixels is drawn pixel by pixel.
-constexpr float kExactDiscPixels = 1.5f;
-// Support of a surfel's kernel over the radius of the disc of its area. At 2.5 the kernels of
-// blue-noise neighbours add up to 1 within a few per cent all over a surface.
-constexpr float kKernelSupport = 2.5f;
-// A node's coverage is spread over a square this much wider than one of its solid angle. The true
-// outlines of neighbours fit together, their squares do not: a little overlap evens out gaps, in
-// which energy is lost (Cornell: rr 0.069 to 0.061, bias -4.3 % to -3.7 % at the coarsest cut).
-constexpr float kCoverageBoxScale = 1.4f;
-// A pixel beyond kFullFrom takes nothing more that lies this much farther than what it took last:
-// that is another surface, behind the gaps of the one in front, and usually a darker one. Cornell,
-// k = 64: bias -1.6 % to -0.7 %; Sponza, pbgi, 1 M surfels, 128x100, against 2048 paths: rr 0.304
-// to 0.289, bias -8.9 % to -7.7 %.
-constexpr float kDepthJump = 1.05f;
-// Opaque discs are drawn this much larger, so that they leave no holes.
-constexpr float kOpaqueDiscScale = 1.4f;
-
 class Rasterizer {
  public:
   Rasterizer(const PointTree& tree, const CutView& view, Splat splat, Microbuffer& buffer,

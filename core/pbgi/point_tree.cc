@@ -4,6 +4,7 @@
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <limits>
 
 #include "core/base/byte_io.h"
 #include "core/base/check.h"
@@ -596,6 +597,20 @@ absl::Status PointTree::AddVisible(std::span<const uint32_t> lit_sides) {
   return absl::OkStatus();
 }
 
+void PointTree::FindExtremes() {
+  F8 largest = Set8(0.0f), layers = Set8(1.0f);
+  for (const PackedSurfels& g : surfels_) {
+    largest = Max8(largest, LoadHalves(g.radius) * Set8(g.frame.unit));
+  }
+  for (const PackedNodes& g : nodes_) {
+    const F8 disc = DiscArea(LoadHalves(g.radius));  // in squared units; of empty slots more than 0
+    const F8 area = Max8(LoadHalves(g.front_area), LoadHalves(g.back_area)) * Set8(kAreaUnits);
+    layers = Max8(layers, area / Max8(disc, Set8(std::numeric_limits<float>::min())));
+  }
+  largest_radius_m_ = Largest(largest);
+  most_layers_ = Largest(layers);
+}
+
 namespace {
 
 bool IsPowerOfTwo(float x, float least, float most) {
@@ -713,6 +728,7 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
   tree->unit_ = RadianceUnit(unit);
   tree->lit_ = (light_bits & kMantissas) != 0;
   FP_RETURN_IF_ERROR(tree->AddVisible(lit_sides));
+  tree->FindExtremes();
   if (lit_sides.empty()) tree->topology_ = std::move(topology);
   tree->radiance_blob_ = std::move(radiance);
   return std::shared_ptr<const PointTree>(std::move(tree));

@@ -123,6 +123,11 @@ class PointTree {
   }
   // Whether any surfel reflects anything.
   bool lit() const { return lit_; }
+  // The radius of the largest surfel.
+  float largest_radius_m() const { return largest_radius_m_; }
+  // The most that a side of an inner node has of visible area over the disc of its radius: 1 on
+  // flat surfaces, more where surfaces lie in layers. At least 1.
+  float most_layers() const { return most_layers_; }
   size_t size_bytes() const {
     return topology_.size() + radiance_blob_.size() + own_surfels_.size() * sizeof(PackedSurfels) +
            own_nodes_.size() * sizeof(PackedNodes);
@@ -131,6 +136,7 @@ class PointTree {
  private:
   // Makes sides visible that are not open: entries slot * 2 + (0 front, 1 back), ascending.
   absl::Status AddVisible(std::span<const uint32_t> lit_sides);
+  void FindExtremes();
 
   Blob topology_, radiance_blob_;
   // If they differ from the blob's.
@@ -143,6 +149,7 @@ class PointTree {
   std::span<const PackedRadiance> radiance_;
   RadianceUnit unit_;
   bool lit_ = false;
+  float largest_radius_m_ = 0, most_layers_ = 1;
 };
 
 // The class (0..5) and the position along the Hilbert curve by which surfels are sorted; x, y, z

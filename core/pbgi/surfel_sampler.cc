@@ -24,7 +24,10 @@ constexpr uint32_t kNone = ~0u;
 constexpr size_t kTrianglesPerPiece = 1024;
 constexpr uint32_t kCandidatesPerPiece = 1u << 15;
 constexpr size_t kSurfelsPerPiece = size_t{1} << 14;
-constexpr uint32_t kSamplerVersion = 1;
+constexpr uint32_t kSamplerVersion = 2;
+// Bits of the spacing in an object's own unit: fewer than a float has, so that a scene modelled in
+// another unit, whose spacing is another float, has the same surfels.
+constexpr int kSpacingBits = 16;
 
 // Rounds to `bits` bits of mantissa.
 double RoundMantissa(double x, int bits) {
@@ -294,8 +297,8 @@ ObjectSampler::ObjectSampler(const ObjectShape& shape, const PreparedScene& prep
                              float spacing_m, uint64_t seed, Executor& executor)
     : impl_(std::make_unique<Impl>(shape, prepared, object, executor)) {
   Impl& impl = *impl_;
-  // Exact: the unit is a power of two.
-  impl.spacing = static_cast<float>(static_cast<double>(spacing_m) / shape.unit_m);
+  impl.spacing = static_cast<float>(
+      RoundMantissa(static_cast<double>(spacing_m) / shape.unit_m, kSpacingBits));
   uint64_t content = 0;
   for (int i = 0; i < 8; ++i) content = content << 8 | shape.digest.bytes[static_cast<size_t>(i)];
   impl.seed = HashKey(seed, content);
@@ -451,18 +454,26 @@ ObjectSurfels ObjectSampler::Sample() {
   return out;
 }
 
-float SurfelSpacingM(double area_m2, uint64_t count) {
-  if (!(area_m2 > 0) || count == 0) return 0;
+namespace {
+
+float RoundedSpacingM(const SurfaceSize& size, double count, int bits) {
+  if (!(size.area_m2 > 0) || !(size.largest_m2 > 0) || !(count > 0)) return 0;
+  const double unit_m = std::sqrt(size.largest_m2);
   return static_cast<float>(
-      RoundMantissa(kSpacingFactor * std::sqrt(area_m2 / static_cast<double>(count)), 7));
+      unit_m *
+      RoundMantissa(kSpacingFactor * std::sqrt(size.area_m2 / size.largest_m2 / count), bits));
 }
 
-float DefaultSurfelSpacingM(double area_m2, float diagonal_m, uint64_t most) {
+}  // namespace
+
+float SurfelSpacingM(const SurfaceSize& size, uint64_t count) {
+  return RoundedSpacingM(size, static_cast<double>(count), 7);
+}
+
+float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t most) {
   const double edge = static_cast<double>(diagonal_m) / 500.0;
-  const double n = std::min(edge > 0 ? area_m2 / (edge * edge) : 0, static_cast<double>(most));
-  if (!(area_m2 > 0)) return 0;
-  return static_cast<float>(
-      RoundMantissa(kSpacingFactor * std::sqrt(area_m2 / std::clamp(n, 1e5, 4e6)), 3));
+  const double n = std::min(edge > 0 ? size.area_m2 / (edge * edge) : 0, static_cast<double>(most));
+  return RoundedSpacingM(size, std::clamp(n, 1e5, 4e6), 3);
 }
 
 SurfelCloud PlaceSurfels(const PreparedScene& prepared, std::span<const ObjectShape> shapes,
@@ -508,7 +519,7 @@ SurfelCloud PlaceSurfels(const PreparedScene& prepared, std::span<const ObjectSh
 SurfelCloud SampleSurfels(const Scene& scene, const PreparedScene& prepared, uint64_t count,
                           uint64_t seed, Executor& executor) {
   const std::vector<ObjectShape> shapes = MakeObjectShapes(scene, prepared, executor);
-  const float spacing_m = SurfelSpacingM(TotalAreaM2(shapes), count);
+  const float spacing_m = SurfelSpacingM(SizeOf(shapes), count);
   if (!(spacing_m > 0)) return {};
   std::vector<std::shared_ptr<const ObjectSurfels>> surfels(shapes.size());
   executor.ForEach(shapes.size(), 1, [&](size_t i) {

@@ -20,14 +20,15 @@
 namespace farpoint {
 
 // The least distance between surfels that gives about `count` of them (within 2 % on large
-// surfaces) on a total area of `area_m2`. Rounded to 7 bits, so that a scene whose area changes a
-// little keeps its surfels. 0 if there is no area or no count.
-float SurfelSpacingM(double area_m2, uint64_t count);
+// surfaces). Rounded, in units of the root of the largest object's area, to 7 bits: a scene whose
+// area changes a little keeps its surfels, and so does one that is modelled in another unit. 0 if
+// there is no area or no count.
+float SurfelSpacingM(const SurfaceSize& size, uint64_t count);
 
 // The spacing when the user names no count: one surfel for each square of edge diagonal/500, but no
-// more than `most`, between 100,000 and 4,000,000, rounded to 3 bits. Depends on the scene only,
-// never on the camera.
-float DefaultSurfelSpacingM(double area_m2, float diagonal_m, uint64_t most);
+// more than `most`, between 100,000 and 4,000,000, rounded to 3 bits in the same unit. Depends on
+// the scene only, never on the camera.
+float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t most);
 
 // Where the surfels of one object lie on it. All of one length. Neighbours in the order are
 // neighbours in space: cubes of 16 spacings along a Morton curve.

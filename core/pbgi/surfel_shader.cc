@@ -15,7 +15,7 @@ constexpr uint32_t kInteriorRays = 4;
 constexpr size_t kPiece = 1024;
 
 struct PieceCounts {
-  uint64_t shadow = 0, interior = 0, inside = 0, black = 0;
+  uint64_t shadow = 0, interior = 0, inside = 0, black = 0, away = 0, environments = 0;
 };
 
 // Seeds a surfel's rays by what it is, not by where it stands in the cloud.
@@ -132,11 +132,12 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
         // rays that it would be shaded with: a room whose walls are modelled outside in shows its
         // back faces everywhere, and a single ray would darken its penumbras.
         const bool open = (visible & bit) != 0;
-        if (black && open && !options.no_skip) {
+        if (black && open && options.skip_black) {
           ++counts.black;
           continue;
         }
-        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters);
+        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters,
+                                        /*refine=*/false, /*environment=*/true, options.needless);
         if (!open) {
           if (!(MaxComponent(e) > 0.0f)) {
             ++counts.inside;
@@ -148,12 +149,16 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
       }
       out.visible_sides[i] = visible;
     }
-    counts.shadow = light_counters.rays;
+    counts.shadow = light_counters.rays + light_counters.needless;
+    counts.away = light_counters.skipped_facing_away;
+    counts.environments = light_counters.skipped_environments;
   });
   for (const PieceCounts& c : piece_counts) {
     stats.counts["shadow_rays"] += c.shadow;
     stats.skipped["surfel_sides_inside"] += c.inside;
     stats.skipped["surfel_sides_black"] += c.black;
+    stats.skipped["shadow_rays"] += c.away;
+    stats.skipped["environment_terms"] += c.environments;
   }
   return out;
 }

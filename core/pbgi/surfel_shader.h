@@ -12,7 +12,8 @@ namespace farpoint {
 struct ShadeOptions {
   uint32_t light_samples = 16;  // per side and light, before the factor below
   uint64_t seed = 0;
-  bool no_skip = false;
+  bool skip_black = true;  // sides that reflect nothing
+  unsigned needless = 0;   // NeedlessLight
 };
 
 // A gather averages many surfels, so each takes a quarter of a receiver's shadow rays.
@@ -27,8 +28,8 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
 
 // Both sides of every surfel: radiance = albedo / pi * E. Visible are the sides that are open and
 // those that a probe of the lights reaches all the same. Surfels are independent of each other.
-// Adds the count "shadow_rays" and skipped "surfel_sides_inside" and "surfel_sides_black" to
-// `stats`.
+// Adds the count "shadow_rays" and skipped "surfel_sides_inside", "surfel_sides_black",
+// "shadow_rays" and "environment_terms" to `stats`.
 SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sides,
                            const RayAccel& accel, const LightSampler& lights,
                            const ShadeOptions& options, Executor& executor, Stats& stats);

@@ -20,8 +20,6 @@ struct Matrix3 {
 // Relative precision of the frame; see the header.
 constexpr double kFrameBits = 0x1p20;
 constexpr double kMaxStretch = 16;
-// Lifts what is a hair below a power of two, so that it takes the exponent of the power itself.
-constexpr double kExponentMargin = 1.0 + 0x1p-22;
 
 // 2^k with 2^k <= x < 2^(k+1), for normal x.
 double PowerOfTwoBelow(double x) {
@@ -65,8 +63,8 @@ void Diagonalize(Matrix3& a, Matrix3& v) {
   }
 }
 
-// A map with the lengths of `linear` (its power of two in `unit`), free of its rotation if it
-// stretches moderately.
+// A map with the lengths of `linear` (the longest in `unit`), free of its rotation if it stretches
+// moderately.
 Affine FrameOf(const Affine& linear, double& unit) {
   const double largest =
       std::max({MaxAbs(linear.column[0]), MaxAbs(linear.column[1]), MaxAbs(linear.column[2])});
@@ -89,19 +87,18 @@ Affine FrameOf(const Affine& linear, double& unit) {
     most = std::max(most, sigma[i]);
   }
   if (most > kMaxStretch * least) {
-    for (int c = 0; c < 3; ++c) frame.column[c] = column[c];
-    unit = 1.0 / inverse;
+    for (int c = 0; c < 3; ++c) frame.column[c] = linear.column[c] / largest;
+    unit = largest;
     return frame;
   }
-  const double power = PowerOfTwoBelow(most * kExponentMargin);
   for (int c = 0; c < 3; ++c) {
     for (int r = 0; r < 3; ++r) {
       double sum = 0;
       for (int k = 0; k < 3; ++k) sum += vectors.m[r][k] * sigma[k] * vectors.m[c][k];
-      frame.column[c][r] = std::nearbyint(sum / power * kFrameBits) / kFrameBits + 0.0;
+      frame.column[c][r] = std::nearbyint(sum / most * kFrameBits) / kFrameBits + 0.0;
     }
   }
-  unit = power / inverse;
+  unit = most / inverse;
   return frame;
 }
 
@@ -179,10 +176,13 @@ std::vector<ObjectShape> MakeObjectShapes(const Scene& scene, const PreparedScen
   return shapes;
 }
 
-double TotalAreaM2(const std::vector<ObjectShape>& shapes) {
-  double total = 0;
-  for (const ObjectShape& shape : shapes) total += shape.area_m2();
-  return total;
+SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes) {
+  SurfaceSize size;
+  for (const ObjectShape& shape : shapes) {
+    size.area_m2 += shape.area_m2();
+    size.largest_m2 = std::max(size.largest_m2, shape.area_m2());
+  }
+  return size;
 }
 
 }  // namespace farpoint

@@ -12,9 +12,9 @@
 namespace farpoint {
 
 // The kept triangles of one object, made from the mesh and the linear part of the instance's
-// transform, without its translation and (but for stretched instances, below) its rotation, and
-// scaled by a power of two. So an object that is moved, or turned, has the same shape bit by bit,
-// wherever the scene's origin lies.
+// transform, without its translation, its size and (but for stretched instances, below) its
+// rotation. So an object that is moved, turned, or scaled alike along all axes has the same shape
+// bit by bit, wherever the scene's origin lies.
 //
 // The frame is that of the symmetric factor of the polar decomposition of the linear part, rounded
 // to 20 bits, so that the rounding errors of a rotation vanish: lengths agree with the world's
@@ -24,7 +24,7 @@ struct ObjectShape {
   std::vector<Vec3f> vertices;                     // in units; 0 where no kept triangle uses it
   std::vector<std::array<uint32_t, 3>> triangles;  // in the prepared scene's order and winding
   std::vector<float> areas;                        // of the triangles, units²
-  double unit_m = 1;                               // metres per unit: a power of two
+  double unit_m = 1;                               // metres per unit
   double area = 0;                                 // units²; the sum of `areas`
   Digest digest;                                   // of vertices and triangles
 
@@ -39,7 +39,10 @@ ObjectShape MakeObjectShape(const Scene& scene, const PreparedScene& prepared, s
 std::vector<ObjectShape> MakeObjectShapes(const Scene& scene, const PreparedScene& prepared,
                                           Executor& executor);
 
-// Σ area_m2 in the order of the objects.
-double TotalAreaM2(const std::vector<ObjectShape>& shapes);
+struct SurfaceSize {
+  double area_m2 = 0;     // of all objects, summed in their order
+  double largest_m2 = 0;  // of the object that has most
+};
+SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes);
 
 }  // namespace farpoint

@@ -4,12 +4,16 @@
 #include <bit>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <type_traits>
 
 #include "core/base/check.h"
+#include "core/base/fp_trap.h"
 #include "core/math/elementary.h"
 #include "core/math/simd8.h"
+#include "core/math/transpose8.h"
 #include "core/math/vec8.h"
+#include "core/pbgi/closed_pixels.h"
 #include "core/pbgi/packed_nodes.h"
 
 namespace farpoint {
@@ -29,7 +33,7 @@ struct LaneView {
   float radius_m, margin_m;
   V8 normal;
   F8 epsilon, sin_spread, cos_spread, size_limit, zero;
-  bool flat, everything_visible_above, sees_inside, cosine_map, sharing;
+  bool flat, everything_visible_above, sees_inside, cosine_map, sharing, skip_invisible_side;
 
   LaneView(const CutView& view, const CutParams& params, bool want_near)
       : position(view.position),
@@ -42,10 +46,11 @@ struct LaneView {
         size_limit(Set8(params.pixel_sr * kCutPixels * kInvPif)),
         zero(Set8(0)),
         flat(view.sin_spread == 0.0f),
-        everything_visible_above(view.sin_spread >= 1.0f),
+        everything_visible_above(view.sin_spread >= 1.0f || !params.skip_below_horizon),
         sees_inside(view.sees_inside),
         cosine_map(params.map == BufferMap::kCosine),
-        sharing(want_near) {}
+        sharing(want_near),
+        skip_invisible_side(params.skip_invisible_side) {}
 };
 
 // 1 / unit, of a power of two, without a division.
@@ -145,25 +150,6 @@ struct Verdict {
   F8 facing;          // mean normal · offset; < 0: its front looks at the view
 };
 
-// Columns of eight become rows of eight.
-inline void Transpose8(__m256 (&m)[8]) {
-  __m256 t[8], u[8];
-  for (int i = 0; i < 8; i += 2) {
-    t[i] = _mm256_unpacklo_ps(m[i], m[i + 1]);
-    t[i + 1] = _mm256_unpackhi_ps(m[i], m[i + 1]);
-  }
-  for (int i = 0; i < 8; i += 4) {
-    u[i] = _mm256_shuffle_ps(t[i], t[i + 2], 0x44);
-    u[i + 1] = _mm256_shuffle_ps(t[i], t[i + 2], 0xee);
-    u[i + 2] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0x44);
-    u[i + 3] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0xee);
-  }
-  for (int i = 0; i < 4; ++i) {
-    m[i] = _mm256_permute2f128_ps(u[i], u[i + 4], 0x20);
-    m[i + 4] = _mm256_permute2f128_ps(u[i], u[i + 4], 0x31);
-  }
-}
-
 // Appends the lanes of `mask`, not empty, to the cut; those of `slots`.
 template <typename Lanes>
 inline void Append(const Lanes& n, const Verdict& verdict, unsigned mask, bool sees_inside,
@@ -237,7 +223,7 @@ inline Verdict Judge(const Lanes& n, const LaneView& v, CutCounters& counters) {
   const unsigned front = n.front(), back = n.back();
   const unsigned seen_front = v.sees_inside ? front | back : front;
   const unsigned seen_back = v.sees_inside ? front | back : back;
-  if ((alive & ~(seen_front & seen_back)) != 0) {
+  if (v.skip_invisible_side && (alive & ~(seen_front & seen_back)) != 0) {
     F8 unit_facing = facing, slack = r + radius;
     if constexpr (!kLeaf) {
       unit_facing = facing * n.inverse_length();
@@ -282,6 +268,9 @@ inline Verdict Judge(const Lanes& n, const LaneView& v, CutCounters& counters) {
   }
   return out;
 }
+
+// Where shells end, in diagonals of the tree.
+constexpr float kShellEnds[] = {1.0f / 8};
 
 struct Pending {
   uint32_t group;
@@ -333,7 +322,171 @@ void Descend(const PointTree& tree, const LaneView& lanes, Pending first, std::v
   }
 }
 
+// Part of its radius by which a quantised node may miss what lies below it
+// (core/pbgi/packed_nodes.h has 2^-15), and relative slack of distances.
+constexpr float kRadiusSlack = 1.001f, kDistanceSlack = 0.9999f;
+
+// Solid angle of the largest node that is drawn as a box, in pixels of mean size: kCutPixels, or of
+// a surfel on the largest pixels, 2.9 times as large.
+constexpr float kLargestBoxPixels = 2.9f * kExactDiscPixels * kExactDiscPixels;
+static_assert(kLargestBoxPixels >= kCutPixels);
+
+// Part of a node's size over that of one that a cut leaves whole from which it is asked whether it
+// is hidden.
+constexpr float kWorthwhileSize = 6.0f;
+
+// The tree's extent.
+float DiagonalOf(const PointTree& tree) {
+  Box3f box;
+  const NodeGroup g = tree.group(tree.root_group());
+  for (uint32_t k = 0; k < kLanes; ++k) {
+    if (g.radius[k] < 0) continue;
+    const Vec3f centre(g.cx[k], g.cy[k], g.cz[k]);
+    box.Extend(centre - Vec3f(g.radius[k]));
+    box.Extend(centre + Vec3f(g.radius[k]));
+  }
+  return Length(box.max - box.min);
+}
+
 }  // namespace
+
+ShellCut::ShellCut(const PointTree& tree, const CutParams& params) : tree_(tree), params_(params) {
+  if (tree.empty()) return;
+  const float diagonal_m = DiagonalOf(tree);
+  for (const float part : kShellEnds) ends_m_.push_back(SortKeyFloor(part * diagonal_m));
+}
+
+void ShellCut::Start(const CutView& view, std::vector<NearNode>* near) {
+  view_ = view;
+  near_ = near;
+  shell_ = 0;
+  distance_m_ = 0;
+  items_.clear();
+  if (tree_.empty()) return;
+  items_.push_back({{tree_.root_group(), 0.0f, {}, 0.0f}, tree_.root_level()});
+}
+
+bool ShellCut::Next(const ClosedPixels* closed, std::vector<CutNode>& cut, CutCounters& counters) {
+  if (items_.empty()) return false;
+  const LaneView lanes(view_, params_, near_ != nullptr);
+  const float end_m =
+      shell_ < ends_m_.size() ? ends_m_[shell_++] : std::numeric_limits<float>::infinity();
+  const U8 iota = {0, 1, 2, 3, 4, 5, 6, 7};
+  const F8 from_m = Set8(distance_m_);
+  // Takes out of a verdict subtrees that touch closed pixels only. What may lie before the shell is
+  // let be: closed pixels are so for what lies in it and beyond.
+  const auto leave_out_hidden = [&]<typename Lanes>(const Lanes& nodes, Verdict& verdict) {
+    // Those that are just a little too large would be asked for too little work.
+    const F8 worthwhile = lanes.size_limit * Set8(kWorthwhileSize);
+    if ((verdict.descend & Bits8(nodes.radius() * nodes.radius() >
+                                 worthwhile * verdict.distance * verdict.distance)) == 0) {
+      return;
+    }
+    const FpTrapPause pause;  // lanes that are not asked
+    const F8 zero = Set8(0.0f);
+    const F8 d = verdict.distance, inverse_d = Set8(1.0f) / d;
+    const V8 w = nodes.offset() * inverse_d;
+    const ClosedPixels::Places places = closed->At(w);
+    const F8 r = nodes.radius();
+    const F8 reach_r = r * Set8(kRadiusSlack);
+    const F8 nearest = (d - reach_r) * Set8(kDistanceSlack);
+    const M8 behind = nearest * Set8(nodes.unit_m()) >= from_m;
+    // Discs drawn pixel by pixel reach beyond their radius by the rest of their kernels' support.
+    const F8 leaf = Set8(tree_.largest_radius_m() * nodes.inverse_unit());
+    const M8 discs = DiscArea(leaf) >
+                     Set8(kExactDiscPixels * kExactDiscPixels * 0.99f * closed->least_pixel_sr()) *
+                         nearest * nearest;
+    const F8 reach =
+        Select8(discs, reach_r + Set8(kKernelSupport - 1.0f) * Min8(reach_r, leaf), reach_r);
+    const F8 sine = reach * inverse_d;
+    // At least the arc sine, up to 0.6.
+    const F8 angle = sine + Set8(0.21f) * sine * sine * sine;
+    const ClosedPixels::Reach image = closed->ReachAbout(w, angle);
+    // The centre of a node below lies within the sphere less its own radius, x in radians; its box
+    // ends box_per_rad x from there.
+    const F8 box_per_rad = Set8(0.5f * kCoverageBoxScale * 1.001f) *
+                           Sqrt8(Set8(kPif * tree_.most_layers()) / image.least_pixel_sr);
+    const F8 sphere = reach_r / nearest;
+    const F8 x = Min8(sphere, Set8(std::sqrt(kLargestBoxPixels * params_.pixel_sr * kInvPif)));
+    const F8 boxes = image.px_per_rad * sphere + Max8(box_per_rad - image.px_per_rad, zero) * x;
+    const F8 half = Max8(image.px_per_rad * angle, boxes) + Set8(0.01f);
+    const unsigned hidden = verdict.descend &
+                            Bits8((sine < Set8(0.6f)) & (nearest > zero) & behind) &
+                            closed->AllClosed(places, half);
+    counters.hidden_subtrees += static_cast<unsigned>(std::popcount(hidden));
+    verdict.descend &= ~hidden;
+  };
+  later_.clear();
+  Item stack[kMaxPending];
+  const auto visit = [&]<typename Packed>(const Packed& group, const Item& at, F8& least_m) {
+    const StoredLanes<Packed> nodes(group, lanes);
+    constexpr bool kLeaf = std::is_same_v<Packed, PackedSurfels>;
+    Verdict verdict = Judge<kLeaf>(nodes, lanes, counters);
+    if constexpr (!kLeaf) {
+      if (closed != nullptr) leave_out_hidden(nodes, verdict);
+    }
+    const uint32_t first = at.node.slot * kLanes;
+    const F8 unit = Set8(nodes.unit_m());
+    if (verdict.splat != 0) {
+      const unsigned inside = Bits8(verdict.distance * unit < Set8(end_m));
+      if ((verdict.splat & inside) != 0) {
+        Append(nodes, verdict, verdict.splat & inside, lanes.sees_inside, iota + first, cut);
+      }
+      if ((verdict.splat & ~inside) != 0) {
+        beyond_.clear();
+        Append(nodes, verdict, verdict.splat & ~inside, lanes.sees_inside, iota + first, beyond_);
+        for (const CutNode& n : beyond_) later_.push_back({n, -1});
+      }
+    }
+    for (unsigned m = verdict.near; m != 0; m &= m - 1) {
+      near_->push_back({first + static_cast<uint32_t>(std::countr_zero(m)), at.level});
+    }
+    const F8 least = (verdict.distance - nodes.radius() * Set8(kRadiusSlack)) * unit;
+    least_m = least * Set8(kDistanceSlack);
+    if (lanes.sharing) {
+      // What may hold near nodes does not wait.
+      const M8 far = Set8(lanes.radius_m * kRadiusSlack) < lanes.epsilon * least;
+      least_m = Select8(far, least_m, Set8(-1.0f));
+    }
+    return verdict.descend;
+  };
+  for (const Item& item : items_) {
+    if (item.node.distance_m >= end_m) {
+      later_.push_back(item);
+      continue;
+    }
+    if (item.level < 0) {
+      cut.push_back(item.node);
+      continue;
+    }
+    int size = 0;
+    stack[size++] = item;
+    while (size > 0) {
+      const Item at = stack[--size];
+      if (at.node.distance_m >= end_m) {
+        later_.push_back(at);
+        continue;
+      }
+      ++counters.groups_visited;
+      F8 least_m;
+      if (at.level == 0) {
+        visit(tree_.packed_surfels(at.node.slot), at, least_m);
+        continue;
+      }
+      const unsigned descend = visit(tree_.packed_nodes(at.node.slot), at, least_m);
+      for (unsigned m = descend; m != 0; m &= m - 1) {
+        const auto k = static_cast<uint32_t>(std::countr_zero(m));
+        FP_DCHECK(size < kMaxPending);
+        const uint32_t child = tree_.ChildGroup(at.level, at.node.slot * kLanes + k);
+        if (least_m[k] < end_m) Prefetch(tree_, child, at.level - 1);
+        stack[size++] = {{child, least_m[k], {}, 0.0f}, at.level - 1};
+      }
+    }
+  }
+  distance_m_ = end_m;
+  items_.swap(later_);
+  return true;
+}
 
 void ComputeClusterCut(const PointTree& tree, const CutView& view, const CutParams& params,
                        std::vector<CutNode>& far, std::vector<NearNode>* near,
@@ -399,17 +552,24 @@ void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutPar
     const UnpackedLanes nodes(near.groups[gi], lanes);
     const Verdict verdict =
         leaf ? Judge<true>(nodes, lanes, counters) : Judge<false>(nodes, lanes, counters);
-    if (verdict.splat != 0) {
+    const auto append = [&](unsigned mask) {
       U8 slots = {};
       for (uint32_t k = 0; k < kLanes && gi * kLanes + k < near.nodes.size(); ++k) {
         slots[k] = near.nodes[gi * kLanes + k].slot;
       }
-      Append(nodes, verdict, verdict.splat, lanes.sees_inside, slots, cut);
-    }
+      Append(nodes, verdict, mask, lanes.sees_inside, slots, cut);
+    };
+    // In the order of the near nodes, whatever others share their group: the order of nodes equally
+    // far must not depend on what was left out.
+    unsigned splat = verdict.splat;
     for (unsigned m = verdict.descend; m != 0; m &= m - 1) {
+      const unsigned before = splat & ((m & -m) - 1u);
+      if (before != 0) append(before);
+      splat &= ~before;
       const NearNode& n = near.nodes[gi * kLanes + std::countr_zero(m)];
       Descend(tree, lanes, {tree.ChildGroup(n.level, n.slot), n.level - 1}, cut, nullptr, counters);
     }
+    if (splat != 0) append(splat);
   }
 }
 

@@ -2,6 +2,7 @@
 // (paper §1.1, §3.2, §3.3).
 #pragma once
 
+#include <bit>
 #include <cstdint>
 #include <span>
 #include <vector>
@@ -45,6 +46,10 @@ struct CutParams {
   // kOctahedral: pixel_sr everywhere; kCosine: pixel_sr / cos theta.
   BufferMap map = BufferMap::kOctahedral;
   float pixel_sr = 0.01f;
+  // Leave out what no receiver can see: nodes below all horizons, which changes what pixels hold
+  // that a horizon cuts, and those of which only invisible sides are seen, which changes no bit of
+  // a buffer.
+  bool skip_below_horizon = true, skip_invisible_side = true;
 };
 
 // A node of a cut, with what drawing it needs: most nodes are drawn without a look into the tree.
@@ -63,9 +68,10 @@ struct NearNode {
 };
 
 struct CutCounters {
-  uint64_t groups_visited = 0;  // eight node tests each
-  uint64_t below_horizon = 0;   // nodes culled: below every receiver's horizon
-  uint64_t invisible_side = 0;  // nodes culled: only sides that cannot be seen
+  uint64_t groups_visited = 0;   // eight node tests each
+  uint64_t below_horizon = 0;    // nodes culled: below every receiver's horizon
+  uint64_t invisible_side = 0;   // nodes culled: only sides that cannot be seen
+  uint64_t hidden_subtrees = 0;  // left out: they touch closed pixels only
 };
 
 // The cut seen from `view`, starting at the root: nodes that are fine enough, or surfels, appended
@@ -86,6 +92,47 @@ void ComputeReceiverCut(const PointTree& tree, const CutView& view, const CutPar
                         const PackedNearNodes& near, std::vector<CutNode>& cut,
                         CutCounters& counters);
 
+class ClosedPixels;
+
+// The cut of ComputeClusterCut in shells, from near to far. Between two shells the caller draws
+// what he got and finds out which pixels are closed; subtrees that touch no other are left out.
+//
+// All nodes of a shell lie beyond those of the shells before, by what SortFrontToBack tells apart,
+// and come in the order of ComputeClusterCut. So the shells, each sorted, are the sorted cut, less
+// what is hidden. One thread; one object serves many views.
+class ShellCut {
+ public:
+  // Both must outlive this.
+  ShellCut(const PointTree& tree, const CutParams& params);
+
+  // `near` as of ComputeClusterCut; must outlive the shells.
+  void Start(const CutView& view, std::vector<NearNode>* near);
+  // Appends the next shell to `cut`, which may come out empty; the first holds all near nodes.
+  // False: there is none. `closed` (null: nothing is) must hold for distances from distance_m() on.
+  bool Next(const ClosedPixels* closed, std::vector<CutNode>& cut, CutCounters& counters);
+  // The least distance of what is to come.
+  float distance_m() const { return distance_m_; }
+  bool done() const { return items_.empty(); }
+
+ private:
+  // A node of the cut, or (level >= 0) a group still to be visited: node.slot is the group,
+  // node.distance_m a bound below the distances of all nodes in it.
+  struct Item {
+    CutNode node;
+    int32_t level;
+  };
+
+  const PointTree& tree_;
+  const CutParams& params_;
+  std::vector<float> ends_m_;  // of the shells but the last
+  CutView view_;
+  std::vector<NearNode>* near_ = nullptr;
+  size_t shell_ = 0;
+  float distance_m_ = 0;
+  std::vector<Item> items_, later_;  // in the order of ComputeClusterCut
+  std::vector<CutNode> beyond_;
+};
+
 // The literal, slow version of both: one node at a time, recursive, straight from the paper and
 // the rules above. The oracle of the tests.
 void ComputeClusterCutLiteral(const PointTree& tree, const CutView& view, const CutParams& params,
@@ -94,5 +141,9 @@ void ComputeClusterCutLiteral(const PointTree& tree, const CutView& view, const 
 // Orders a cut front to back: by distance to within 2^-7, ties by traversal order. Stable and
 // deterministic; linear.
 void SortFrontToBack(std::vector<CutNode>& cut, std::vector<CutNode>& scratch);
+// The least distance that SortFrontToBack does not tell from this one.
+inline float SortKeyFloor(float distance_m) {
+  return std::bit_cast<float>(std::bit_cast<uint32_t>(distance_m) & 0xffff0000u);
+}
 
 }  // namespace farpoint

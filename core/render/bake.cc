@@ -96,13 +96,14 @@ Digest GeometryKey(const Scene& scene, const PreparedScene& prepared) {
   return hash.Finish();
 }
 
-float SpacingFor(const RenderSettings& settings, double area_m2, const PreparedScene& prepared) {
-  if (settings.points != 0) return SurfelSpacingM(area_m2, settings.points);
+float SpacingFor(const RenderSettings& settings, const SurfaceSize& size,
+                 const PreparedScene& prepared) {
+  if (settings.points != 0) return SurfelSpacingM(size, settings.points);
   // Where light is soft and faces are large, light is smooth. A map may hold a sun.
   constexpr uint64_t kMostPerTriangle = 64;
   const bool sharp = !prepared.lights().empty() || prepared.has_environment_map();
   return DefaultSurfelSpacingM(
-      area_m2, prepared.diagonal_m(),
+      size, prepared.diagonal_m(),
       sharp ? ~uint64_t{0} : kMostPerTriangle * prepared.triangles().size());
 }
 
@@ -116,7 +117,7 @@ class TreeBake {
         prepared_(std::move(prepared)),
         settings_(settings),
         options_(options),
-        cache_(settings.no_skip ? nullptr : options.cache),
+        cache_(settings.skips(kSkipBakeStages) ? options.cache : nullptr),
         executor_(executor),
         stats_(stats) {}
 
@@ -155,9 +156,8 @@ class TreeBake {
   void FindKeys() {
     StageTimer timer(stats_, Stage::kSample);
     shapes_ = MakeObjectShapes(scene_, *prepared_, executor_);
-    spacing_m_ = options_.surfel_spacing_m > 0
-                     ? options_.surfel_spacing_m
-                     : SpacingFor(settings_, TotalAreaM2(shapes_), *prepared_);
+    spacing_m_ = options_.surfel_spacing_m > 0 ? options_.surfel_spacing_m
+                                               : SpacingFor(settings_, SizeOf(shapes_), *prepared_);
     if (spacing_m_ > 0) {
       samplers_.resize(shapes_.size());
       executor_.ForEach(shapes_.size(), 1, [&](size_t i) {
@@ -189,7 +189,7 @@ class TreeBake {
       lights = std::make_unique<const LightSampler>(accel);
     }
     SurfelCloud cloud;
-    const bool lit = lights->any_light() || settings_.no_skip;
+    const bool lit = lights->any_light() || !settings_.skips(kSkipUnlit);
     if (lit) {
       StageTimer timer(stats_, Stage::kSample);
       cloud = Sample();
@@ -222,7 +222,8 @@ class TreeBake {
       ShadeOptions options;
       options.light_samples = settings_.light_samples;
       options.seed = settings_.seed;
-      options.no_skip = settings_.no_skip;
+      options.skip_black = settings_.skips(kSkipBlack);
+      options.needless = NeedlessLightOf(settings_);
       shading =
           ShadeSurfels(cloud, topology->open_sides, *accel, *lights, options, executor_, stats_);
     }
@@ -287,9 +288,11 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
   std::shared_ptr<const PreparedScene> prepared;
   {
     StageTimer timer(stats, Stage::kImport);
-    FP_ASSIGN_OR_RETURN(prepared, PreparedScene::Prepare(scene, executor));
+    FP_ASSIGN_OR_RETURN(prepared,
+                        PreparedScene::Prepare(scene, executor, {!settings.skips(kSkipTextures)}));
     baked.prepared_scene = prepared->blob();
   }
+  stats.skipped["textures"] += prepared->skipped_textures();
   stats.counts["triangles"] = prepared->triangles().size();
   stats.bytes["scene"] = baked.prepared_scene.size();
   if (!settings.point_based()) return baked;
@@ -301,7 +304,7 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
 absl::StatusOr<float> SurfelSpacing(const Scene& scene, const RenderSettings& settings,
                                     Executor& executor) {
   FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(scene, executor));
-  return SpacingFor(settings, TotalAreaM2(MakeObjectShapes(scene, *prepared, executor)), *prepared);
+  return SpacingFor(settings, SizeOf(MakeObjectShapes(scene, *prepared, executor)), *prepared);
 }
 
 }  // namespace farpoint

@@ -39,6 +39,7 @@ struct BakeOptions {
 // Adds its stage seconds and counts to `stats`; with a cache also skipped "bake_stages" (surfels of
 // all objects, topology, radiance: up to 3), "objects_kept", "surfels_kept" (of kept objects, not
 // sampled again) and "surfels_shaded_kept". settings.no_skip leaves the cache alone.
+// Further skipped: "textures" (not decoded), "bakes_without_light" and what ShadeSurfels adds.
 // kInvalidArgument if the scene cannot be rendered; kCancelled.
 absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settings,
                                 Executor& executor, Stats& stats, const BakeOptions& options = {});

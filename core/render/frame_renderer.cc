@@ -13,6 +13,7 @@
 #include "core/base/clock.h"
 #include "core/irrcache/irradiance_cache.h"
 #include "core/math/sampling.h"
+#include "core/pbgi/cut_drawer.h"
 #include "core/pbgi/microbuffer.h"
 #include "core/pbgi/microbuffer_map.h"
 #include "core/pbgi/receiver_cluster.h"
@@ -72,6 +73,8 @@ struct Counters {
   uint64_t exact_discs = 0, own_records = 0;
   uint64_t skipped_no_receivers = 0, skipped_black = 0, skipped_unlit = 0, skipped_shadow = 0;
   uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
+  uint64_t skipped_hidden_nodes = 0, skipped_hidden_subtrees = 0;
+  uint64_t skipped_environments = 0, skipped_black_hits = 0;
 };
 
 // One image sample: where the primary ray went.
@@ -85,6 +88,17 @@ struct Sample {
   float weight = 0, heaviest = 0;  // of the records that serve it, adaptive clusters
   float openness = 0;              // as they blend it, if the sky's light comes from them
 };
+
+// A block's samples, and what they hit.
+struct Primary {
+  std::vector<Sample> samples;
+  std::vector<Receiver> receivers;
+  std::vector<uint32_t> sample_of;  // of each receiver
+  std::vector<uint8_t> wanted;      // by receiver: its pixel lies in the tile
+};
+
+// Tiles of more samples than this do not keep what their primary rays hit while records are made.
+constexpr int64_t kMostSamplesKept = 1 << 18;
 
 // The parameters of adaptive clusters, measured in docs/decisions/0015-adaptive-clusters.md and
 // 0024-faster-gather.md.
@@ -144,6 +158,8 @@ class Renderer final : public FrameRenderer {
         map_(settings_.buffer_map, settings_.microbuffer_px()),
         filter_(settings_.filter, settings_.filter_width()),
         ray_grid_(HierarchyOf(settings_).coarsest_samples) {
+    cut_params_.skip_below_horizon = settings_.skips(kSkipBelowHorizon);
+    cut_params_.skip_invisible_side = settings_.skips(kSkipInvisibleSide);
     cut_params_.epsilon = settings_.epsilon;
     cut_params_.map = settings_.buffer_map;
     cut_params_.pixel_sr = map_.reference_solid_angle();
@@ -155,6 +171,8 @@ class Renderer final : public FrameRenderer {
         wants(Layer::kIrradiance) || wants(Layer::kStdError) || wants(Layer::kCutSize);
     wants_direct_irradiance_ = wants(Layer::kDirectIrradiance);
     wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
+    // Who asks for the size of cuts asks for that of whole ones.
+    hide_ = settings_.skips(kSkipHidden) && !wants(Layer::kCutSize);
     wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
                       wants(Layer::kCluster);
     wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
@@ -197,8 +215,23 @@ class Renderer final : public FrameRenderer {
       }
       return cancel == nullptr || !cancel->load(std::memory_order_relaxed);
     };
+    std::vector<std::optional<Primary>> primary(blocks.size());
     std::shared_ptr<const ReceiverHierarchy::View> view;
-    if (NeedsHierarchy()) {
+    bool gathers = true;
+    PixelRect gathered = tile;
+    if (NeedsHierarchy() && settings_.skips(kSkipIdleBlocks) &&
+        tile.area() * int64_t{settings_.spp} <= kMostSamplesKept) {
+      executor.ForEach(blocks.size(), 1, [&](size_t i) {
+        primary[i].emplace();
+        TracePrimary(blocks[i], tile, *primary[i], block_stats[i]);
+      });
+      gathered = WhereLightIsGathered(blocks, tile, primary);
+      gathers = !gathered.empty();
+      uint64_t idle = 0;
+      for (const PixelRect& block : blocks) idle += gathered.Intersect(block).empty();
+      out.stats.skipped["blocks_without_gather"] += idle;
+    }
+    if (NeedsHierarchy() && gathers) {
       const double cpu = ProcessCpuSeconds();
       ReceiverHierarchy::Counts counts;
       std::call_once(scaled_, [&] {
@@ -218,7 +251,7 @@ class Renderer final : public FrameRenderer {
         gatherer_->Refine(deviation);
         hierarchy_ = std::make_unique<ReceiverHierarchy>(params, frame_.film.frame(), *gatherer_);
       });
-      view = hierarchy_->Prepare(tile, executor, go_on, counts);
+      view = hierarchy_->Prepare(gathered, executor, go_on, counts);
       Stats stats = gatherer_->TakeStats();
       if (!view) return absl::CancelledError("the tile was cancelled");
       // What is not gathering is choosing.
@@ -229,6 +262,8 @@ class Renderer final : public FrameRenderer {
       stats.counts["clusters"] += counts.records;
       stats.counts["cluster_candidates"] += counts.candidates;
       stats.counts["cluster_samples"] += counts.samples;
+      // Places that others serve well enough.
+      stats.skipped["clusters"] += counts.candidates - std::min(counts.candidates, counts.records);
       out.stats += stats;
     }
     const IrradianceCache* cache = nullptr;
@@ -242,8 +277,15 @@ class Renderer final : public FrameRenderer {
         cancelled = true;
         return;
       }
-      if (!RenderBlock(blocks[i], tile, view.get(), cache, out.film, block_stats[i]))
+      if (!primary[i]) {
+        primary[i].emplace();
+        TracePrimary(blocks[i], tile, *primary[i], block_stats[i]);
+      }
+      if (!RenderBlock(blocks[i], tile, *primary[i], gathers, view.get(), cache, out.film,
+                       block_stats[i])) {
         finite = false;
+      }
+      primary[i].reset();
       if (progress) {
         const std::lock_guard lock(progress_mutex);
         progress(++done, total);
@@ -268,43 +310,73 @@ class Renderer final : public FrameRenderer {
   }
 
  private:
-  // False if a value is not finite.
-  bool RenderBlock(const PixelRect& block, const PixelRect& tile,
+  // What the camera sees of a block. The samples to be computed are those of pixels inside the
+  // tile; clusters are made of all receivers of the block, so that a tile or a crop changes
+  // nothing.
+  void TracePrimary(const PixelRect& block, const PixelRect& tile, Primary& out,
+                    Stats& stats) const {
+    StageClock clock;
+    Counters n;
+    const uint32_t spp = settings_.spp;
+    out.samples.resize(static_cast<size_t>(block.area()) * spp);
+    TracePrimary(block, out.samples, out.receivers, out.sample_of, n);
+    const PixelRect inside = block.Intersect(tile);
+    out.wanted.resize(out.receivers.size());
+    for (size_t r = 0; r < out.receivers.size(); ++r) {
+      const int64_t pixel = out.sample_of[r] / spp;
+      out.wanted[r] = inside.Contains(block.x0 + static_cast<int>(pixel % block.width()),
+                                      block.y0 + static_cast<int>(pixel / block.width()));
+      n.receivers += out.wanted[r];
+    }
+    if (out.receivers.empty()) n.skipped_no_receivers = 1;
+    clock.Charge(Stage::kPrimary);
+    clock.Finish(stats);
+    Report(n, stats);
+  }
+
+  // A receiver whose albedo is black shows no indirect light; it is gathered only if its irradiance
+  // or its cluster itself was asked for.
+  bool GathersBlack() const {
+    return wants_irradiance_ || wants_cluster_ || (sky_by_records_ && wants_direct_irradiance_);
+  }
+  static bool IsBlack(const Sample& sample) { return !(MaxComponent(sample.albedo) > 0.0f); }
+
+  // The part of the tile that holds all blocks with receivers that gather.
+  PixelRect WhereLightIsGathered(std::span<const PixelRect> blocks, const PixelRect& tile,
+                                 std::span<const std::optional<Primary>> primary) const {
+    const bool gathers_black = GathersBlack() || !settings_.skips(kSkipBlack);
+    PixelRect all{tile.x1, tile.y1, tile.x0, tile.y0};
+    for (size_t i = 0; i < blocks.size(); ++i) {
+      const Primary& p = *primary[i];
+      bool any = false;
+      for (size_t r = 0; r < p.receivers.size() && !any; ++r) {
+        any = p.wanted[r] != 0 && (gathers_black || !IsBlack(p.samples[p.sample_of[r]]));
+      }
+      if (!any) continue;
+      const PixelRect part = blocks[i].Intersect(tile);
+      all = {std::min(all.x0, part.x0), std::min(all.y0, part.y0), std::max(all.x1, part.x1),
+             std::max(all.y1, part.y1)};
+    }
+    return all.x0 < all.x1 ? all : PixelRect{tile.x0, tile.y0, tile.x0, tile.y0};
+  }
+
+  // `gathers`: false: adaptive clusters have nothing to serve. False if a value is not finite.
+  bool RenderBlock(const PixelRect& block, const PixelRect& tile, Primary& primary, bool gathers,
                    const ReceiverHierarchy::View* view, const IrradianceCache* cache, Film& film,
                    Stats& stats) const {
     StageClock clock;
     Counters n;
-    const uint32_t spp = settings_.spp;
-    std::vector<Sample> samples(static_cast<size_t>(block.area()) * spp);
-    std::vector<Receiver> receivers;
-    std::vector<uint32_t> sample_of;  // of each receiver
-    TracePrimary(block, samples, receivers, sample_of, n);
-    clock.Charge(Stage::kPrimary);
-
-    // The samples to be computed: those of pixels inside the tile. Clusters are made of all
-    // receivers of the block, so that a tile or a crop changes nothing.
     const PixelRect inside = block.Intersect(tile);
-    std::vector<uint8_t> wanted(receivers.size());
-    for (size_t r = 0; r < receivers.size(); ++r) {
-      const int64_t pixel = sample_of[r] / spp;
-      wanted[r] = inside.Contains(block.x0 + static_cast<int>(pixel % block.width()),
-                                  block.y0 + static_cast<int>(pixel / block.width()));
-      n.receivers += wanted[r];
-    }
-    if (receivers.empty()) n.skipped_no_receivers = 1;
-
+    auto& [samples, receivers, sample_of, wanted] = primary;
     if (wants_direct_ && scene_.lights->any_light()) {
       Direct(block, samples, receivers, sample_of, wanted, n);
     }
     clock.Charge(Stage::kDirect);
 
     if (WantsGather() && !receivers.empty()) {
-      // A receiver whose albedo is black shows no indirect light; it is gathered only if its
-      // irradiance itself was asked for.
-      const bool also_black = wants_irradiance_ || (sky_by_records_ && wants_direct_irradiance_);
-      if (!also_black && !settings_.no_skip) {
+      if (!GathersBlack() && settings_.skips(kSkipBlack)) {
         for (size_t r = 0; r < receivers.size(); ++r) {
-          if (wanted[r] && !(MaxComponent(samples[sample_of[r]].albedo) > 0.0f)) {
+          if (wanted[r] && IsBlack(samples[sample_of[r]])) {
             wanted[r] = 0;
             ++n.skipped_black;
           }
@@ -323,7 +395,7 @@ class Renderer final : public FrameRenderer {
       } else if (view != nullptr) {
         Blend(*view, block, samples, receivers, sample_of, wanted, n, stats, clock);
         clock.Charge(Stage::kConvolve);
-      } else {
+      } else if (gathers) {
         Gather(block, samples, receivers, sample_of, wanted, n, clock);
         if (gatherer_) stats += gatherer_->TakeStats();
       }
@@ -333,6 +405,7 @@ class Renderer final : public FrameRenderer {
     clock.Charge(Stage::kConvolve);
     clock.Finish(stats);
     Report(n, stats);
+    stats.counts["blocks"] += 1;
     return finite;
   }
 
@@ -394,24 +467,22 @@ class Renderer final : public FrameRenderer {
     for (size_t r = 0; r < receivers.size(); ++r) {
       if (!wanted[r]) continue;
       Sample& sample = samples[sample_of[r]];
-      const bool black = !(MaxComponent(sample.albedo) > 0.0f);
-      if (black && !wants_direct_irradiance_ && !settings_.no_skip) {
+      if (IsBlack(sample) && !wants_direct_irradiance_ && settings_.skips(kSkipBlack)) {
         ++n.skipped_black;
         continue;
       }
       sample.direct_e = scene_.lights->Irradiance(
           receivers[r].position, receivers[r].geometric_normal, receivers[r].normal, each,
           PixelKey(block, sample_of[r], kKeyDirect), (sample_of[r] % settings_.spp) * each, 0,
-          counters, true, !sky_by_records_);
+          counters, true, !sky_by_records_, NeedlessLightOf(settings_));
     }
-    n.rays += counters.rays;
-    n.skipped_shadow += counters.skipped_facing_away;
+    Add(counters, n);
   }
 
   void TracePaths(const PixelRect& block, std::vector<Sample>& samples,
                   const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
                   const std::vector<uint8_t>& wanted, Counters& n) const {
-    if (!scene_.lights->any_light() && !settings_.no_skip) {
+    if (!scene_.lights->any_light() && settings_.skips(kSkipUnlit)) {
       n.skipped_unlit += receivers.size();
       return;
     }
@@ -421,12 +492,18 @@ class Renderer final : public FrameRenderer {
       const TracedIrradiance traced = TraceIndirect(
           *scene_.accel, *scene_.lights, receivers[r], settings_.paths,
           HashKey(PixelKey(block, sample_of[r], kKeyPath), sample_of[r] % settings_.spp), counters,
-          n.rays);
+          n.rays, NeedlessLightOf(settings_), !settings_.skips(kSkipBlack));
       samples[sample_of[r]].indirect_e = traced.irradiance;
       samples[sample_of[r]].standard_error = traced.standard_error;
     }
-    n.rays += counters.rays;
+    Add(counters, n);
+  }
+
+  static void Add(const LightCounters& counters, Counters& n) {
+    n.rays += counters.rays + counters.needless;
     n.skipped_shadow += counters.skipped_facing_away;
+    n.skipped_environments += counters.skipped_environments;
+    n.skipped_black_hits += counters.skipped_black;
   }
 
   // Records may bring direct light, too.
@@ -435,13 +512,13 @@ class Renderer final : public FrameRenderer {
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
     return settings_.adaptive() && WantsGather() &&
-           (settings_.no_skip || (scene_.tree != nullptr && scene_.tree->lit()));
+           (!settings_.skips(kSkipUnlit) || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
   // Without light there is nothing to cache.
   bool NeedsCache() const {
     return settings_.integrator == Integrator::kIrrcache && wants_indirect_ &&
-           (settings_.no_skip || scene_.lights->any_light());
+           (!settings_.skips(kSkipUnlit) || scene_.lights->any_light());
   }
 
   // The cache of the whole frame, made by the first tile that asks; others wait for it. Null:
@@ -622,7 +699,7 @@ class Renderer final : public FrameRenderer {
               const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
               const std::vector<uint8_t>& wanted, Counters& n, StageClock& clock) const {
     const PointTree& tree = *scene_.tree;
-    if (!tree.lit() && !settings_.no_skip) {
+    if (!tree.lit() && settings_.skips(kSkipUnlit)) {
       n.skipped_unlit += receivers.size();
       return;
     }
@@ -654,11 +731,13 @@ class Renderer final : public FrameRenderer {
     const bool by_rays =
         settings_.integrator == Integrator::kFpbgi && settings_.fill_in_force() == Fill::kRays;
     Microbuffer far_buffer(map_), near_buffer(map_);
+    CutDrawer drawer(tree, map_, cut_params_, settings_.splat, hide_);
     std::vector<CutNode> cut, scratch;
     std::vector<NearNode> near;
     PackedNearNodes packed;
     CutCounters cut_counters;
     RasterCounters raster_counters;
+    HiddenCounters hidden_counters;
     for (size_t c = 0; c < clusters.size(); ++c) {
       const ReceiverCluster& cluster = clusters[c];
       const bool any = std::any_of(cluster.members.begin(), cluster.members.end(),
@@ -690,16 +769,13 @@ class Renderer final : public FrameRenderer {
       view.cos_spread = cluster.cos_spread;
       view.margin_m = cluster.margin_m;
       view.sees_inside = cluster.sees_inside;
-      cut.clear();
       near.clear();
-      ComputeClusterCut(tree, view, cut_params_, cut, alone ? nullptr : &near, cut_counters);
-      n.cut_nodes += cut.size() + near.size();
-      const size_t shared_nodes = cut.size();
-      clock.Charge(Stage::kCut);
-      far_buffer.Clear();
-      SortFrontToBack(cut, scratch);
-      RasterizeCut(tree, view, cut, settings_.splat, far_buffer, raster_counters);
-      clock.Charge(Stage::kRaster);
+      const size_t shared_nodes =
+          drawer.Draw(view, alone ? nullptr : &near, far_buffer, cut_counters, raster_counters,
+                      hidden_counters, [&](CutDrawer::Part part) {
+                        clock.Charge(part == CutDrawer::Part::kCut ? Stage::kCut : Stage::kRaster);
+                      });
+      n.cut_nodes += shared_nodes + near.size();
       packed.Pack(tree, near);
       clock.Charge(Stage::kCut);
 
@@ -739,6 +815,8 @@ class Renderer final : public FrameRenderer {
     n.splats += raster_counters.splats;
     n.exact_discs += raster_counters.exact_discs;
     n.skipped_hidden += raster_counters.hidden_pixels;
+    n.skipped_hidden_nodes += hidden_counters.nodes;
+    n.skipped_hidden_subtrees += cut_counters.hidden_subtrees;
   }
 
   // Samples to pixels; they were drawn by the filter, so all count alike. False if a value is not
@@ -852,7 +930,6 @@ class Renderer final : public FrameRenderer {
 
   static void Report(const Counters& n, Stats& stats) {
     stats.counts["receivers"] += n.receivers;
-    stats.counts["blocks"] += 1;
     stats.counts["clusters"] += n.clusters;
     stats.counts["cut_nodes"] += n.cut_nodes;
     stats.counts["rays"] += n.rays;
@@ -867,6 +944,10 @@ class Renderer final : public FrameRenderer {
     stats.skipped["nodes_below_horizon"] += n.skipped_horizon;
     stats.skipped["nodes_invisible_side"] += n.skipped_invisible;
     stats.skipped["pixels_hidden"] += n.skipped_hidden;
+    stats.skipped["nodes_hidden"] += n.skipped_hidden_nodes;
+    stats.skipped["subtrees_hidden"] += n.skipped_hidden_subtrees;
+    stats.skipped["environment_terms"] += n.skipped_environments;
+    stats.skipped["black_hits"] += n.skipped_black_hits;
   }
 
   std::shared_ptr<const LoadedScene> holder_;
@@ -885,6 +966,7 @@ class Renderer final : public FrameRenderer {
   mutable std::unique_ptr<const IrradianceCache> cache_;  // irrcache
   bool wants_cluster_;
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
+  bool hide_;            // leave out of cuts what lies behind a filled part of the buffer
   bool sky_by_records_;  // direct light of a constant sky comes from records
 };
 

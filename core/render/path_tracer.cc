@@ -25,7 +25,8 @@ uint32_t FirstOf(uint32_t batch, uint32_t paths) {
 
 TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights,
                                const Receiver& receiver, uint32_t paths, uint64_t key,
-                               LightCounters& counters, uint64_t& rays) {
+                               LightCounters& counters, uint64_t& rays, unsigned needless,
+                               bool keep_black) {
   const PreparedScene& scene = accel.scene();
   const Frame8 frame{V8(receiver.normal)};
   const V8 ng(receiver.geometric_normal);
@@ -63,7 +64,9 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
       hits.b2[i] = hit->b2;
     }
     for (uint32_t i = 0; i < hits.count; ++i) hits.direction.Set(i, directions[hits.ray[i]]);
-    KeepWhatReflects(scene, hits);
+    const uint32_t met = hits.count;
+    KeepWhatReflects(scene, hits, keep_black);
+    counters.skipped_black += met - hits.count;
     std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
     std::array<V8, kRaysTogether / kHitLanes> irradiance;
     const size_t groups = (hits.count + kHitLanes - 1) / kHitLanes;
@@ -72,7 +75,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
       points[g].active = (1u << std::min(kHitLanes, hits.count - g * kHitLanes)) - 1u;
     }
     lights.IrradianceEach(std::span(points).first(groups), light_key, 2,
-                          std::span(irradiance).first(groups), counters);
+                          std::span(irradiance).first(groups), counters, needless);
     for (uint32_t i = 0; i < hits.count; ++i) {
       const Rgb arriving = irradiance[i / kHitLanes].Lane(i % kHitLanes);
       // Textures are looked up where light arrives only.

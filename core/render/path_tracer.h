@@ -19,9 +19,11 @@ struct TracedIrradiance {
 // about the shading normal; E_direct with one shadow ray per light. Unbiased. Owen-scrambled
 // Sobol' points: dimensions 0, 1 choose the direction, 2, 3 the point on the light. The standard
 // error comes from eight consecutive runs of N/8 paths, whose own errors are larger than their
-// share of the whole sequence's: it errs on the high side.
+// share of the whole sequence's: it errs on the high side. `needless`:
+// NeedlessLight, `keep_black`: also hits on what reflects nothing ask for light; the same bits.
 TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights,
                                const Receiver& receiver, uint32_t paths, uint64_t key,
-                               LightCounters& counters, uint64_t& rays);
+                               LightCounters& counters, uint64_t& rays, unsigned needless = 0,
+                               bool keep_black = false);
 
 }  // namespace farpoint

@@ -31,13 +31,15 @@ V8 GeometricNormals(const V8& a, const V8& b, const V8& c) {
 
 }  // namespace
 
-void KeepWhatReflects(const PreparedScene& scene, RayHits& hits) {
+void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black) {
   uint32_t kept = 0;
   for (uint32_t i = 0; i < hits.count; ++i) {
     const uint32_t t = hits.triangle[i];
     const PreparedTriangle& triangle = scene.triangles()[t];
     const PreparedObject& object = scene.objects()[triangle.object];
-    if (!(MaxComponent(scene.materials()[object.material].base_color) > 0.0f)) continue;
+    if (!keep_black && !(MaxComponent(scene.materials()[object.material].base_color) > 0.0f)) {
+      continue;
+    }
     const bool flat = object.has_normals == 0;
     const uint32_t k = kept++;
     hits.ray[k] = hits.ray[i];

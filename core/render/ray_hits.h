@@ -41,8 +41,8 @@ struct RayHits {
 };
 
 // Fetches corners and normals of the hits. Those on what is black without a look at its texture are
-// taken out; the lanes of the last eight that are left over repeat the last.
-void KeepWhatReflects(const PreparedScene& scene, RayHits& hits);
+// taken out unless `keep_black`; the lanes of the last eight that are left over repeat the last.
+void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black = false);
 
 // Where hits `first` (a multiple of eight) to `first + 7` lie, with normals on the side that the
 // rays came from, to the bits of PreparedScene's functions. `active` is left to the caller.

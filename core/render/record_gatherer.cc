@@ -8,6 +8,7 @@
 
 #include "core/base/clock.h"
 #include "core/math/sampling.h"
+#include "core/pbgi/cut_drawer.h"
 #include "core/pbgi/microbuffer.h"
 #include "core/render/ray_hits.h"
 
@@ -450,14 +451,18 @@ GatherRecord RecordGatherer::GatherByCut(const Receiver& receiver,
   view.position = receiver.position;
   view.normal = receiver.normal;
   view.sees_inside = receiver.on_back;
-  std::vector<CutNode> cut, scratch;
-  CutCounters cut_counters;
-  ComputeClusterCut(tree, view, cut_params_, cut, nullptr, cut_counters);
-  const double after_cut = ThreadCpuSeconds();
   Microbuffer buffer(map_);
+  CutCounters cut_counters;
   RasterCounters raster_counters;
-  SortFrontToBack(cut, scratch);
-  RasterizeCut(tree, view, cut, settings_.splat, buffer, raster_counters);
+  HiddenCounters hidden_counters;
+  double clock = start, cut_s = 0;
+  CutDrawer drawer(tree, map_, cut_params_, settings_.splat, settings_.skips(kSkipHidden));
+  const size_t cut_nodes = drawer.Draw(view, nullptr, buffer, cut_counters, raster_counters,
+                                       hidden_counters, [&](CutDrawer::Part part) {
+                                         const double now = ThreadCpuSeconds();
+                                         if (part == CutDrawer::Part::kCut) cut_s += now - clock;
+                                         clock = now;
+                                       });
 
   // The strata read the pixels that hold their centres.
   const Frame frame(receiver.normal);
@@ -488,15 +493,17 @@ GatherRecord RecordGatherer::GatherByCut(const Receiver& receiver,
   record.irradiance = ConvolveCosine(buffer, nullptr, receiver.normal, settings_.splat);
   const double end = ThreadCpuSeconds();
   const std::lock_guard lock(mutex_);
-  stats_.seconds[static_cast<int>(Stage::kCut)] += after_cut - start;
-  stats_.seconds[static_cast<int>(Stage::kRaster)] += end - after_cut;
-  stats_.counts["cut_nodes"] += cut.size();
+  stats_.seconds[static_cast<int>(Stage::kCut)] += cut_s;
+  stats_.seconds[static_cast<int>(Stage::kRaster)] += end - start - cut_s;
+  stats_.counts["cut_nodes"] += cut_nodes;
   stats_.counts["node_visits"] += cut_counters.groups_visited * kLanes;
   stats_.counts["splats"] += raster_counters.splats;
   stats_.counts["exact_discs"] += raster_counters.exact_discs;
   stats_.skipped["nodes_below_horizon"] += cut_counters.below_horizon;
   stats_.skipped["nodes_invisible_side"] += cut_counters.invisible_side;
   stats_.skipped["pixels_hidden"] += raster_counters.hidden_pixels;
+  stats_.skipped["nodes_hidden"] += hidden_counters.nodes;
+  stats_.skipped["subtrees_hidden"] += cut_counters.hidden_subtrees;
   return record;
 }
 

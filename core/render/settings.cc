@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "core/image/tile_rect.h"
+#include "core/light/light_sampler.h"
 
 namespace farpoint {
 
@@ -55,6 +56,11 @@ uint32_t RenderSettings::cache_samples_in_force() const {
 
 float RenderSettings::filter_width() const {
   return filter_width_px != 0.0f ? filter_width_px : kFilterWidths[static_cast<size_t>(filter)];
+}
+
+unsigned NeedlessLightOf(const RenderSettings& settings) {
+  return (settings.skips(kSkipShadowRays) ? 0u : kNeedlessRays) |
+         (settings.skips(kSkipEnvironment) ? 0u : kNeedlessEnvironment);
 }
 
 absl::Status ValidateSettings(const RenderSettings& s) {

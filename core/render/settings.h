@@ -35,6 +35,20 @@ enum class Fill : uint32_t {
 // The error that adaptive clusters aim at: how many, and how finely sampled.
 enum class Quality : uint32_t { kDraft, kNormal, kFine };
 
+// What a frame computes only if the scene needs it (docs/skipping.md). Values of a mask.
+enum SkipMask : uint32_t {
+  kSkipBlack = 1u << 0,          // receivers, surfels and hits that reflect nothing
+  kSkipUnlit = 1u << 1,          // surfels and gathers of a scene without light
+  kSkipIdleBlocks = 1u << 2,     // records where no receiver of a block gathers
+  kSkipBelowHorizon = 1u << 3,   // nodes below the horizons of all receivers; changes bits
+  kSkipInvisibleSide = 1u << 4,  // nodes of which only sides inside closed objects are seen
+  kSkipHidden = 1u << 5,         // nodes behind a filled part of the buffer
+  kSkipShadowRays = 1u << 6,     // of lights that cannot reach
+  kSkipEnvironment = 1u << 7,    // of a scene that has none
+  kSkipTextures = 1u << 8,       // that no surface shows
+  kSkipBakeStages = 1u << 9,     // whose product an earlier bake left
+};
+
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
@@ -61,6 +75,7 @@ struct RenderSettings {
   // --- Changes only the speed ---
   uint32_t tile_px = 128;  // a multiple of 32
   bool no_skip = false;    // compute also what the scene does not need
+  uint32_t computed = 0;   // SkipMask: the same for single items, to measure them; not on the wire
 
   // The value in force where 0 means "default".
   uint32_t microbuffer_px() const;
@@ -73,7 +88,11 @@ struct RenderSettings {
   bool adaptive() const { return integrator == Integrator::kFpbgi && clusters == 0; }
   Fill fill_in_force() const;
   float filter_width() const;  // pixels
+  bool skips(SkipMask item) const { return !no_skip && (computed & item) == 0; }
 };
+
+// For LightSampler: NeedlessLight of what the settings do not skip.
+unsigned NeedlessLightOf(const RenderSettings& settings);
 
 // kInvalidArgument names the setting, its value and what is allowed.
 absl::Status ValidateSettings(const RenderSettings& settings);

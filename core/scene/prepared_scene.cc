@@ -161,11 +161,18 @@ uint64_t GeometryKey(const Mesh& mesh, const std::vector<bool>& used) {
   return key;
 }
 
+// Coarse enough for the rounding of another unit to vanish.
+constexpr double kKeyBits = 0x1p20;
+
 uint64_t ContentKey(uint64_t geometry_key, const Affine& world_from_mesh) {
   const Affine linear = NormalizedLinear(world_from_mesh);
+  const double largest = LargestEntry(linear);
   uint64_t key = geometry_key;
   for (const Vec3d& column : linear.column) {
-    for (int c = 0; c < 3; ++c) key = HashKey(key, BitsOf(column[c]));
+    for (int c = 0; c < 3; ++c) {
+      const double part = largest > 0 ? column[c] / largest : column[c];
+      key = HashKey(key, BitsOf(std::nearbyint(part * kKeyBits)));
+    }
   }
   return key;
 }
@@ -197,7 +204,8 @@ absl::Status BadBlob(const std::string& text) {
 // Builds the tables of a prepared scene.
 class Builder {
  public:
-  Builder(const Scene& scene, Executor& executor) : scene_(scene), executor_(executor) {}
+  Builder(const Scene& scene, Executor& executor, const PrepareOptions& options)
+      : scene_(scene), executor_(executor), options_(options) {}
 
   absl::StatusOr<Blob> Build() {
     FP_RETURN_IF_ERROR(CheckReferences());
@@ -211,6 +219,7 @@ class Builder {
 
   // By object, after Build.
   std::vector<uint32_t> TakeObjectInstances() { return std::move(object_instances_); }
+  uint64_t skipped_textures() const { return skipped_textures_; }
 
  private:
   const Mesh& MeshOf(const Instance& instance) const { return scene_.meshes[instance.mesh]; }
@@ -447,6 +456,8 @@ class Builder {
       const FpTrapPause pause;
       decoded[i] = DecodeImage(images[i]->name, images[i]->encoded.bytes());
     });
+    skipped_textures_ = scene_.textures.size() - images.size();
+    if (options_.all_textures) DecodeForNothing();
     texels_.reserve(total);
     for (const auto& image : decoded) {
       if (!image.ok()) return image.status();
@@ -460,6 +471,19 @@ class Builder {
                            static_cast<uint32_t>(source.wrap_t), source.nearest ? 1u : 0u, 0});
     }
     return absl::OkStatus();
+  }
+
+  // Textures that no surface shows may be damaged or too large: nobody asked for them.
+  void DecodeForNothing() {
+    skipped_textures_ = 0;
+    executor_.ForEach(scene_.textures.size(), 1, [&](size_t t) {
+      if (prepared_texture_[t] >= 0) return;
+      const Texture& texture = scene_.textures[t];
+      const FpTrapPause pause;
+      const auto size = ReadImageSize(texture.name, texture.encoded.bytes());
+      if (!size.ok() || uint64_t{size->width} * size->height > kMaxTexels) return;
+      (void)DecodeImage(texture.name, texture.encoded.bytes());
+    });
   }
 
   // A mask without holes is opaque, and rays need not ask for its alpha.
@@ -732,6 +756,8 @@ class Builder {
   std::vector<PreparedObject> objects_;
   std::vector<uint32_t> object_instances_;
   std::vector<PreparedMaterial> materials_;
+  const PrepareOptions options_;
+  uint64_t skipped_textures_ = 0;
   std::vector<PreparedTexture> textures_;
   std::vector<uint32_t> texels_;
   std::vector<PreparedLight> lights_;
@@ -744,22 +770,23 @@ class Builder {
 
 }  // namespace
 
-absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Prepare(const Scene& scene,
-                                                                            Executor& executor) {
-  Builder builder(scene, executor);
+absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Prepare(
+    const Scene& scene, Executor& executor, const PrepareOptions& options) {
+  Builder builder(scene, executor, options);
   FP_ASSIGN_OR_RETURN(Blob blob, builder.Build());
-  return Make(std::move(blob), builder.TakeObjectInstances());
+  return Make(std::move(blob), builder.TakeObjectInstances(), builder.skipped_textures());
 }
 
 absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::FromBlob(Blob blob) {
-  return Make(std::move(blob), {});
+  return Make(std::move(blob), {}, 0);
 }
 
 absl::StatusOr<std::shared_ptr<const PreparedScene>> PreparedScene::Make(
-    Blob blob, std::vector<uint32_t> object_instances) {
+    Blob blob, std::vector<uint32_t> object_instances, uint64_t skipped_textures) {
   std::shared_ptr<PreparedScene> scene(new PreparedScene());
   scene->blob_ = std::move(blob);
   scene->object_instances_ = std::move(object_instances);
+  scene->skipped_textures_ = skipped_textures;
   if (const absl::Status status = scene->Read(); !status.ok()) {
     return Annotate(status, "prepared scene");
   }

@@ -33,9 +33,10 @@ struct PreparedObject {
   uint64_t first_triangle, triangle_count;
   uint32_t material;
   uint32_t has_normals;  // 1: vertex normals are valid; 0: flat
-  uint64_t content_key;  // hash of the mesh's geometry and the instance's linear transform, each
-                         // without its power of two: seeds sampling, unchanged when the object
-                         // only moves, its peers change or the scene is scaled by 2^n
+  uint64_t content_key;  // hash of the mesh's geometry without its power of two and of the
+                         // instance's linear transform without its size, to 20 bits: seeds
+                         // sampling, unchanged when the object only moves, its peers change or
+                         // the scene is scaled
 };
 
 struct PreparedMaterial {
@@ -75,6 +76,11 @@ struct SurfaceSample {
   float alpha;   // 1 unless the material is a mask
 };
 
+struct PrepareOptions {
+  // Decodes also the textures that no surface shows, and drops them: the same blob.
+  bool all_textures = false;
+};
+
 class PreparedScene {
  public:
   // Flattens, decodes the textures that are used, drops degenerate triangles, checks that all is
@@ -82,8 +88,8 @@ class PreparedScene {
   // must lie within 2^-30 and 2^60 m, so that areas and squared distances are normal floats.
   // Mirrored instances keep the front of their faces: their triangles are wound the other way.
   // The front of vertex normals that are zero or not finite is made up from the triangles.
-  static absl::StatusOr<std::shared_ptr<const PreparedScene>> Prepare(const Scene& scene,
-                                                                      Executor& executor);
+  static absl::StatusOr<std::shared_ptr<const PreparedScene>> Prepare(
+      const Scene& scene, Executor& executor, const PrepareOptions& options = {});
   // Reads a blob; every offset and index is checked. kDataLoss says what and where. The blob is
   // kept and viewed in place.
   static absl::StatusOr<std::shared_ptr<const PreparedScene>> FromBlob(Blob blob);
@@ -128,6 +134,9 @@ class PreparedScene {
   bool has_alpha_masks() const { return has_alpha_masks_; }
   // Triangles that Prepare left out because they are degenerate.
   uint64_t dropped_triangles() const { return dropped_triangles_; }
+  // Textures of the Scene that Prepare did not decode, because no surface shows them or because
+  // they are multiplied by black, and images that it decoded once for several textures.
+  uint64_t skipped_textures() const { return skipped_textures_; }
   // By object: the index of the instance that it was made of, in the Scene given to Prepare. The
   // vertices of that instance's mesh, in their order, follow those of the object before. Empty if
   // the scene was read from a blob.
@@ -161,7 +170,7 @@ class PreparedScene {
  private:
   PreparedScene() = default;
   static absl::StatusOr<std::shared_ptr<const PreparedScene>> Make(
-      Blob blob, std::vector<uint32_t> object_instances);
+      Blob blob, std::vector<uint32_t> object_instances, uint64_t skipped_textures);
   absl::Status Read();
   absl::Status CheckTables() const;
   absl::Status CheckGeometry();
@@ -190,6 +199,7 @@ class PreparedScene {
   std::span<const float> map_floats_;
   bool has_alpha_masks_ = false;
   uint64_t dropped_triangles_ = 0;
+  uint64_t skipped_textures_ = 0;
 };
 
 }  // namespace farpoint

@@ -69,12 +69,40 @@ TEST_P(FrameOf, IsIndependentOfThreadsTilesOrderAndCrops) {
   }
 }
 
+// All that is skipped but nodes below horizons, which reach into the pixels that a horizon cuts.
+constexpr uint32_t kExactSkips = ~uint32_t{kSkipBelowHorizon};
+
+bool FillsByCuts(const RenderSettings& s) {
+  return s.point_based() &&
+         !(s.integrator == Integrator::kFpbgi && s.fill_in_force() == Fill::kRays);
+}
+
 TEST_P(FrameOf, SkippingChangesNoBit) {
   const Scene scene = MakeCornellBox();
   RenderSettings s = Small(GetParam());
-  const Digest skipped = ImageHash(RenderScene(scene, scene.cameras[0], Whole(64, 64), s).film);
+  const Rendered skipped = RenderScene(scene, scene.cameras[0], Whole(64, 64), s);
+  s.computed = kExactSkips;
+  EXPECT_EQ(ImageHash(RenderScene(scene, scene.cameras[0], Whole(64, 64), s).film),
+            ImageHash(skipped.film));
+  s.computed = 0;
   s.no_skip = true;
-  EXPECT_EQ(ImageHash(RenderScene(scene, scene.cameras[0], Whole(64, 64), s).film), skipped);
+  const Rendered all = RenderScene(scene, scene.cameras[0], Whole(64, 64), s);
+  if (!FillsByCuts(s)) {
+    EXPECT_EQ(ImageHash(all.film), ImageHash(skipped.film));
+    return;
+  }
+  // docs/skipping.md
+  const ErrorOfLayer e = Compare(skipped.film, all.film, Layer::kIrradiance);
+  EXPECT_GT(e.rr, 0);
+  EXPECT_LT(e.rr, 0.03);
+  EXPECT_LT(std::fabs(e.bias), 0.01);
+  // Nothing is left out any more but what an algorithm is made of.
+  for (const char* item :
+       {"nodes_below_horizon", "nodes_invisible_side", "nodes_hidden", "subtrees_hidden",
+        "shadow_rays", "environment_terms", "black_receivers", "textures"}) {
+    const auto at = all.stats.skipped.find(item);
+    EXPECT_TRUE(at == all.stats.skipped.end() || at->second == 0) << item;
+  }
 }
 
 // Thin strips, black and white in turn, so that samples of a pixel lie on several.
@@ -97,10 +125,10 @@ TEST_P(FrameOf, LayersAndSkippingChangeNoBitUnderASky) {
   RenderSettings s = Small(GetParam());
   s.spp = 4;
   const FilmSpec film = Whole(48, 32);
-  const auto hash = [&](std::vector<Layer> layers, Layer of, bool no_skip) {
+  const auto hash = [&](std::vector<Layer> layers, Layer of, bool skip_nothing) {
     RenderSettings asked = s;
     asked.layers = std::move(layers);
-    asked.no_skip = no_skip;
+    if (skip_nothing) asked.computed = kExactSkips;
     const Film all = RenderScene(scene, scene.cameras[0], film, asked).film;
     Film one(film.crop, {of});
     for (int y = 0; y < film.height; ++y) {
@@ -204,6 +232,35 @@ TEST(Frame, BackgroundOnlyBlocksCostNothing) {
   EXPECT_EQ(r.stats.skipped.at("blocks_without_receivers"), 4u);
   EXPECT_EQ(r.stats.counts.at("receivers"), 0u);
   for (const float z : r.film.Plane(Layer::kDepth, 0)) EXPECT_TRUE(std::isinf(z));
+}
+
+// A lamp fills the upper half of the frame: no records there, and none at all where the lamp is all
+// that is seen.
+TEST(Frame, BlocksThatSeeOnlyWhatIsBlackAreNotGathered) {
+  Scene scene = MakeCornellBox();
+  AddLambert(scene, QuadMesh({-2, 2.7f, -3}, {8, 2.7f, -3}, {8, 9, -3}, {-2, 9, -3}), 0);
+  scene.materials.back().emission = Rgb(3, 2, 1);
+  RenderSettings s = Small(Integrator::kFpbgi);
+  s.clusters = 0;
+  s.layers = {Layer::kBeauty};
+  const FilmSpec film = Whole(128, 128);
+  const Rendered part = RenderScene(scene, scene.cameras[0], film, s);
+  EXPECT_GE(part.stats.skipped.at("blocks_without_gather"), 6u);
+  EXPECT_GT(part.stats.counts.at("clusters"), 0u);
+  s.computed = kExactSkips;
+  const Rendered whole = RenderScene(scene, scene.cameras[0], film, s);
+  EXPECT_EQ(ImageHash(part.film), ImageHash(whole.film));
+  EXPECT_LT(part.stats.counts.at("clusters"), whole.stats.counts.at("clusters"));
+  s.computed = 0;
+  FilmSpec lamp = film;
+  lamp.crop = {0, 0, 128, 32};
+  const Rendered dark = RenderScene(scene, scene.cameras[0], lamp, s);
+  EXPECT_EQ(dark.stats.skipped.at("blocks_without_gather"), 4u);
+  EXPECT_EQ(dark.stats.counts.count("clusters") == 0 || dark.stats.counts.at("clusters") == 0,
+            true);
+  s.layers = {Layer::kBeauty, Layer::kIrradiance};  // now it is asked for
+  EXPECT_EQ(RenderScene(scene, scene.cameras[0], lamp, s).stats.skipped.at("blocks_without_gather"),
+            0u);
 }
 
 TEST(Frame, TinyImagesWork) {

@@ -211,6 +211,23 @@ TEST(SurfelSampler, ScalingByAPowerOfTwoScalesTheSurfels) {
   }
 }
 
+// Another unit of length leaves no trace, but for the rounding of positions.
+TEST(SurfelSampler, ScalingKeepsTheSurfels) {
+  const Scene scene = MakeCornellBox();
+  const SurfelCloud before = Sample(scene, 5000);
+  for (const double scale : {1e-3, 0.3, 1.9, 12.7, 1e3}) {
+    Scene scaled = scene;
+    for (Instance& instance : scaled.instances) {
+      for (Vec3d& column : instance.world_from_mesh.column) column *= scale;
+      instance.world_from_mesh.translation *= scale;
+    }
+    const SurfelCloud after = Sample(scaled, 5000);
+    EXPECT_EQ(before.triangle, after.triangle) << scale;
+    EXPECT_EQ(before.barycentric, after.barycentric) << scale;
+    EXPECT_EQ(Prepare(scene)->objects()[0].content_key, Prepare(scaled)->objects()[0].content_key);
+  }
+}
+
 TEST(SurfelSampler, KeysNameWhatDecides) {
   const Scene scene = MakeCornellBox();
   const auto prepared = Prepare(scene);
@@ -312,19 +329,25 @@ TEST(SurfelSampler, SmallObjectsGetAtLeastOne) {
 }
 
 TEST(SurfelSpacing, ChangesInSteps) {
-  EXPECT_EQ(SurfelSpacingM(0, 100), 0);
-  EXPECT_EQ(SurfelSpacingM(1, 0), 0);
+  EXPECT_EQ(SurfelSpacingM({}, 100), 0);
+  EXPECT_EQ(SurfelSpacingM({1, 1}, 0), 0);
   // About sqrt(area / count), in steps of less than 0.8 %.
-  EXPECT_NEAR(SurfelSpacingM(4, 10000), 0.759 * 0.02, 0.004 * 0.02);
-  EXPECT_EQ(SurfelSpacingM(4, 10000), SurfelSpacingM(std::nextafter(4.0, 5.0), 10000));
-  EXPECT_EQ(SurfelSpacingM(16, 10000), 2 * SurfelSpacingM(4, 10000));
+  EXPECT_NEAR(SurfelSpacingM({4, 3}, 10000), 0.759 * 0.02, 0.004 * 0.02);
+  EXPECT_EQ(SurfelSpacingM({4, 3}, 10000), SurfelSpacingM({std::nextafter(4.0, 5.0), 3}, 10000));
+  // Another unit, another length, the same in parts of the scene.
+  EXPECT_EQ(SurfelSpacingM({16, 12}, 10000), 2 * SurfelSpacingM({4, 3}, 10000));
+  for (const double scale : {1e-3, 0.3, 7.7, 1e3}) {
+    EXPECT_FLOAT_EQ(SurfelSpacingM({4 * scale * scale, 3 * scale * scale}, 10000),
+                    static_cast<float>(scale) * SurfelSpacingM({4, 3}, 10000));
+  }
   // 500 squares along the diagonal, within the limits.
   constexpr uint64_t kAny = ~uint64_t{0};
-  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, kAny), 0.759 / 500, 0.07 * 0.759 / 500);
-  EXPECT_NEAR(DefaultSurfelSpacingM(2, 1, 125'000), 0.759 / 250, 0.07 * 0.759 / 250);
-  EXPECT_NEAR(DefaultSurfelSpacingM(0.001, 1, kAny), 0.759 * std::sqrt(0.001 / 1e5), 2e-5 * 0.8);
-  EXPECT_NEAR(DefaultSurfelSpacingM(1, 1, 7), 0.759 * std::sqrt(1 / 1e5), 0.07 * 0.0024);
-  EXPECT_EQ(DefaultSurfelSpacingM(0, 0, kAny), 0);
+  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, kAny), 0.759 / 500, 0.07 * 0.759 / 500);
+  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, 125'000), 0.759 / 250, 0.07 * 0.759 / 250);
+  EXPECT_NEAR(DefaultSurfelSpacingM({0.001, 0.001}, 1, kAny), 0.759 * std::sqrt(0.001 / 1e5),
+              2e-5 * 0.8);
+  EXPECT_NEAR(DefaultSurfelSpacingM({1, 1}, 1, 7), 0.759 * std::sqrt(1 / 1e5), 0.07 * 0.0024);
+  EXPECT_EQ(DefaultSurfelSpacingM({}, 0, kAny), 0);
 }
 
 }  // namespace
