@@ -48,6 +48,7 @@ Json ToJson(const JobStatus& status) {
   json["after"] = Json::array();
   for (const JobId& id : status.after) json["after"].push_back(id.value);
   json["title"] = status.title;
+  json["owner"] = status.owner;
   json["priority"] = status.priority;
   json["error"] = status.error.ok() ? Json(nullptr) : Json(std::string(status.error.message()));
   return json;

@@ -21,17 +21,25 @@ inline constexpr int kMaxRequestBytes = 32 << 20;
 inline constexpr int kMaxResponseBytes = 128 << 20;
 
 // Connects in the background. Without keepalive a link that goes down would never be noticed; with
-// it in 3 s.
+// it in 3 s. Channels of one process to one address share a connection, but for those with one of
+// their own.
 std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
-                                           const ChannelSecurity& security = {});
+                                           const ChannelSecurity& security = {},
+                                           bool own_connection = false);
 
 // What of a failed call's cause can be found out by looking: with a connection that failed
 // (kUnavailable), ProbeConnection's answer if that is worth more; else `status` as it is.
 absl::Status ExplainFailure(const absl::Status& status, const std::string& address,
                             const ChannelSecurity& security);
 
-// The same on the server's side: keepalive, limits of messages, streams and time to connect.
-void ConfigureServer(grpc::ServerBuilder& builder);
+// What a server's connections may hold in memory together, unread messages above all. Beyond it the
+// library closes idle connections, then ends calls with RESOURCE_EXHAUSTED: a message of many MiB
+// is gathered whole before its size is looked at.
+inline constexpr size_t kDefaultNetworkBytes = size_t{48} << 20;
+
+// The same on the server's side: keepalive, limits of messages, streams, memory and time to
+// connect.
+void ConfigureServer(grpc::ServerBuilder& builder, size_t network_bytes = kDefaultNetworkBytes);
 // Asks every peer for a certificate and takes whatever comes: who uses this checks each call.
 std::shared_ptr<grpc::ServerCredentials> ServerTls(const TlsMaterial& material);
 

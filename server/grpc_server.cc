@@ -84,7 +84,7 @@ class GrpcServerImpl final : public GrpcServer {
     }();
     (void)reflection;
     grpc::ServerBuilder builder;
-    ConfigureServer(builder);
+    ConfigureServer(builder, options_.network_bytes);
     std::shared_ptr<grpc::ServerCredentials> credentials = grpc::InsecureServerCredentials();
     if (options_.tls) {
       credentials = ServerTls(*options_.tls);

@@ -22,6 +22,7 @@ struct GrpcServerOptions {
   std::string tokens_file, revoked_file;
   double calls_per_second = 500;  // of a client
   size_t max_connections = 8192, max_connections_per_host = 4096;
+  size_t network_bytes = size_t{48} << 20;  // proto/grpc_channel.h, ConfigureServer
   // With TLS: what clients own and may use; its ledger lies in this file (empty: in memory).
   std::string ledger_file;
   std::function<bool(const Digest&)> has_blob;                 // ClientLedgerOptions

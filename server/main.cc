@@ -2,6 +2,7 @@
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <string>
@@ -34,6 +35,7 @@ struct ServerFlags {
   TlsFlags tls;
   std::string tokens, revoked;
   uint64_t max_connections = 8192, max_connections_per_host = 4096, max_calls_per_second = 500;
+  uint64_t network_memory_mib = 48;
   uint64_t max_jobs_per_client = 1000, max_bytes_per_client = uint64_t{1} << 40;
 };
 
@@ -60,6 +62,8 @@ void DefineSecurityFlags(CLI::App& app, ServerFlags& flags) {
   limit("--max-connections", flags.max_connections, "Most connections");
   limit("--max-connections-per-host", flags.max_connections_per_host,
         "Most connections of one host");
+  limit("--network-memory-mib", flags.network_memory_mib,
+        "Memory for what connections send, together; beyond it calls are ended, to be tried again");
   limit("--max-calls-per-second", flags.max_calls_per_second, "Of a client; with TLS only");
   limit("--max-jobs-per-client", flags.max_jobs_per_client, "Not ended; with TLS only");
   limit("--max-bytes-per-client", flags.max_bytes_per_client, "Of scene files; with TLS only");
@@ -136,6 +140,7 @@ absl::StatusOr<GrpcServerOptions> ServerOptionsOf(const ServerFlags& flags) {
   options.max_connections = flags.max_connections;
   options.max_connections_per_host = flags.max_connections_per_host;
   options.calls_per_second = static_cast<double>(flags.max_calls_per_second);
+  options.network_bytes = flags.network_memory_mib << 20;
   options.max_jobs_per_client = flags.max_jobs_per_client;
   options.max_bytes_per_client = flags.max_bytes_per_client;
   // Each connection takes a descriptor; the store, blobs and bakes take some, too.
@@ -146,9 +151,11 @@ absl::StatusOr<GrpcServerOptions> ServerOptionsOf(const ServerFlags& flags) {
   }
   options.ledger_file = flags.store + "/clients.sqlite";
   std::string blobs = flags.store + "/blobs";
+  if (!flags.blob_dir.empty()) blobs = flags.blob_dir;
   options.has_blob = [blobs](const Digest& digest) {
     return ::access((blobs + "/" + digest.Hex()).c_str(), F_OK) == 0;
   };
+  options.blob_directory = flags.blob_dir;
   options.facts = [store = flags.store, limits = flags.limits,
                    max_blob_bytes = flags.max_blob_bytes] {
     ServerFacts facts;

@@ -34,6 +34,7 @@ class Process {
   Process(const Process&) = delete;
   Process& operator=(const Process&) = delete;
 
+  pid_t pid() const { return pid_; }
   void Signal(int signal);
   bool Running();
   // Its exit code, 128 + n if signal n ended it, none if it still runs after `time`.
