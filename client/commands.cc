@@ -376,7 +376,9 @@ absl::Status Doctor(const CommandLine& line, const StopFlag& stop) {
                .store = line.store,
                .listen = line.listen,
                .cache = line.cache,
-               .blob_directory = line.blob_dir},
+               .blob_directory = line.blob_dir,
+               .patience = std::chrono::milliseconds(
+                   static_cast<int64_t>(1000 * std::clamp(line.patience_s, 0.1, 4.0)))},
               [&](const ChannelSecurity& security) {
                 return MakeGrpcFarmLink(line.coordinator, stop, security);
               });

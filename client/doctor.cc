@@ -24,9 +24,6 @@ namespace farpoint {
 
 namespace {
 
-using std::chrono::milliseconds;
-
-constexpr milliseconds kProbeTime{4000};
 constexpr int64_t kMaxSkewMs = 60'000;
 constexpr int64_t kDayS = 24 * 3600;
 constexpr int64_t kSoonS = 14 * kDayS;
@@ -292,7 +289,8 @@ std::optional<CoordinatorHealth> LookAtCoordinator(const DoctorRequest& request,
                                                    const ChannelSecurity& security,
                                                    const Connect& connect, Report& report) {
   const std::string& address = request.coordinator;
-  if (const absl::Status status = ProbeConnection(address, security, kProbeTime); !status.ok()) {
+  if (const absl::Status status = ProbeConnection(address, security, request.patience);
+      !status.ok()) {
     report.Bad("connection", status);
     return std::nullopt;
   }
@@ -356,12 +354,6 @@ std::vector<Finding> JudgeProcess(const OpenFileFacts& files) {
                "a process may have only " + std::to_string(files.limit) +
                    " open files here; raise the limit (ulimit -n 65536, or LimitNOFILE= of a "
                    "systemd unit)");
-  }
-  if (const std::string missing = MissingProcessorFeature(); !missing.empty()) {
-    report.Bad("processor",
-               "this processor has no " + missing +
-                   ", which pixels are computed with; take a machine of 2013 or later, or "
-                   "let the virtual machine pass its processor through");
   }
   if (report.findings.empty()) {
     report.Good("machine", "processor and limits are fit; " +

@@ -39,6 +39,7 @@ struct DoctorRequest {
   std::string scene;
   uint64_t points = 0;  // surfels of the scene; 0: not known
   std::string store, listen, cache, blob_directory;
+  std::chrono::milliseconds patience{4000};  // with a coordinator that does not answer
 };
 
 // In the order in which they were looked at. `connect` makes the link to the coordinator.

@@ -2,7 +2,6 @@
 
 #include <dirent.h>
 #include <fcntl.h>
-#include <sys/platform/x86.h>
 #include <sys/resource.h>
 #include <sys/statvfs.h>
 #include <unistd.h>
@@ -111,21 +110,17 @@ absl::Status CheckWritable(const std::string& folder) {
   std::string path = folder + "/.farpoint-XXXXXX";
   const Descriptor fd(::mkostemp(path.data(), O_CLOEXEC));
   if (!fd.valid()) {
-    if (errno == ENOENT) return FileError("there is no folder", folder, errno);
-    return DiskError("cannot write into", folder, errno);
+    const int error = errno;
+    // A file system like /proc says "no such file" of what cannot be made in it.
+    if (error == ENOENT && ::access(folder.c_str(), F_OK) != 0) {
+      return FileError("there is no folder", folder, error);
+    }
+    return DiskError("cannot write into", folder, error);
   }
   static constexpr std::array<std::byte, 4096> kBytes{};
   const absl::Status written = WriteAll(fd.get(), kBytes, path);
   ::unlink(path.c_str());
   return written;
-}
-
-std::string MissingProcessorFeature() {
-  if (!CPU_FEATURE_ACTIVE(AVX2)) return "AVX2";
-  if (!CPU_FEATURE_ACTIVE(FMA)) return "FMA";
-  if (!CPU_FEATURE_ACTIVE(BMI2)) return "BMI2";
-  if (!CPU_FEATURE_ACTIVE(F16C)) return "F16C";
-  return "";
 }
 
 }  // namespace farpoint

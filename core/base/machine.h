@@ -31,8 +31,4 @@ absl::StatusOr<DiskFacts> ReadDiskFacts(const std::string& folder);
 // kUnavailable says why it cannot be written.
 absl::Status CheckWritable(const std::string& folder);
 
-// Whether this processor, as far as the C library may use it, has what the programs are compiled
-// for (x86-64-v3). Empty, or the first thing that is missing: "AVX2".
-std::string MissingProcessorFeature();
-
 }  // namespace farpoint

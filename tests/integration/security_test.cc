@@ -2,6 +2,7 @@
 // before a handler runs, and says why on both sides.
 #include <gmock/gmock.h>
 #include <grpcpp/grpcpp.h>
+#include <grpcpp/impl/codegen/client_unary_call.h>
 #include <gtest/gtest.h>
 #include <signal.h>
 #include <sys/inotify.h>
