@@ -14,7 +14,7 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array<std::string_view, 2> kNotBuilt = {"skip", "service"};
+constexpr std::array<std::string_view, 1> kNotBuilt = {"service"};
 
 // "1280x1000". Sizes are checked by ValidateFilm.
 bool ParseResolution(std::string_view text, int& width, int& height) {
@@ -70,7 +70,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
     return absl::UnimplementedError("'" + args.front() +
                                     "' is not built yet; use accuracy, paper, pareto, scale, "
-                                    "rebake, lights, micro or stability");
+                                    "rebake, lights, micro, skip or stability");
   }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
@@ -309,6 +309,27 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
 
+  SkipOptions& k = line.skip;
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) k.scenes_dir = scenes;
+  CLI::App* skip = app.add_subcommand(
+      "skip",
+      "What each item that is left out saves, and what asking costs; writes skip.json and "
+      "skip.html; 42 if bits or an error are not as promised");
+  AddCommonOptions(*skip, line.output_dir, k.quick);
+  skip->add_option("--case", k.cases, "Only this one; may be given more than once");
+  skip->add_option("--scenes", k.scenes_dir,
+                   "Folder of scenes of others [FARPOINT_SCENES; without one Sponza is left out]");
+  skip->add_option("--points", k.points, "Surfels [100000, quick: 3000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  skip->add_option("--light-samples", k.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  skip->add_option("--seed", k.seed, "Of every random choice")->capture_default_str();
+  skip->add_option("--repeat", k.repeat, "Rounds [7, quick: 1]")->check(CLI::Range(1, 1000));
+  skip->add_option("--threads", k.threads, "0: all cores; 1 disturbs the times least")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -321,6 +342,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                             : paper->parsed()     ? paper
                             : stability->parsed() ? stability
                             : scale->parsed()     ? scale
+                            : skip->parsed()      ? skip
                                                   : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -337,6 +359,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
               : paper->parsed()     ? BenchVerb::kPaper
               : stability->parsed() ? BenchVerb::kStability
               : scale->parsed()     ? BenchVerb::kScale
+              : skip->parsed()      ? BenchVerb::kSkip
                                     : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
@@ -409,6 +432,13 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
     if (std::find(known_stability.begin(), known_stability.end(), name) == known_stability.end()) {
       return absl::InvalidArgumentError(
           Concat({"--case ", name, " is none of ", absl::StrJoin(known_stability, ", ")}));
+    }
+  }
+  const std::vector<std::string> known_skips = SkipNames();
+  for (const std::string& name : k.cases) {
+    if (std::find(known_skips.begin(), known_skips.end(), name) == known_skips.end()) {
+      return absl::InvalidArgumentError(
+          Concat({"--case ", name, " is none of ", absl::StrJoin(known_skips, ", ")}));
     }
   }
   if (line.output_dir.empty()) return absl::InvalidArgumentError("-o needs the name of a folder");

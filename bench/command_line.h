@@ -12,12 +12,13 @@
 #include "bench/pareto.h"
 #include "bench/rebake.h"
 #include "bench/scale.h"
+#include "bench/skip.h"
 #include "bench/stability.h"
 #include "core/base/status.h"
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability, kScale };
+enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability, kScale, kSkip };
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
@@ -30,6 +31,7 @@ struct BenchCommandLine {
   PaperOptions paper;
   StabilityOptions stability;
   ScaleOptions scale;
+  SkipOptions skip;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -11,6 +11,7 @@
 #include "bench/paper_report.h"
 #include "bench/pareto_report.h"
 #include "bench/scale_report.h"
+#include "bench/skip_report.h"
 #include "bench/stability_report.h"
 #include "core/base/blob.h"
 #include "core/image/png_io.h"
@@ -150,6 +151,28 @@ absl::Status Scale(const BenchCommandLine& line, std::ostream& out, std::ostream
   return absl::OkStatus();
 }
 
+absl::Status Skip(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "skip.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const SkipReport report, RunSkip(line.skip, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_RETURN_IF_ERROR(WriteText(dir / "skip.json", SkipJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "skip.html", SkipHtml(report)));
+  out << SkipTable(report) << "\n"
+      << (dir / "skip.json").string() << "\n"
+      << (dir / "skip.html").string() << "\n";
+  if (report.failures() > 0) {
+    return absl::FailedPreconditionError("skip: " + std::to_string(report.failures()) +
+                                         " promises do not hold (the table lists them)");
+  }
+  return absl::OkStatus();
+}
+
 absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
   FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
                         err << "farpoint-bench: " << text << std::endl;
@@ -200,6 +223,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Stability(line, out, err);
     case BenchVerb::kScale:
       return Scale(line, out, err);
+    case BenchVerb::kSkip:
+      return Skip(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
