@@ -59,7 +59,9 @@ std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
   arguments.SetInt(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
   arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
-  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 1000);
+  // How long an attempt may take. A handshake takes milliseconds of the coordinator's time, and
+  // after its restart a whole farm wants one.
+  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, security.tls ? 3000 : 1000);
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
   // A farm is not reached through the proxy that a machine's browser wants.
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);

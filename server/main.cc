@@ -34,7 +34,7 @@ struct ServerFlags {
   JobLimits limits;
   TlsFlags tls;
   std::string tokens, revoked;
-  uint64_t max_connections = 8192, max_connections_per_host = 4096, max_calls_per_second = 500;
+  uint64_t max_connections = 8192, max_connections_per_host = 0, max_calls_per_second = 500;
   uint64_t network_memory_mib = 48;
   uint64_t max_jobs_per_client = 1000, max_bytes_per_client = uint64_t{1} << 40;
 };
@@ -60,8 +60,10 @@ void DefineSecurityFlags(CLI::App& app, ServerFlags& flags) {
         ->capture_default_str();
   };
   limit("--max-connections", flags.max_connections, "Most connections");
-  limit("--max-connections-per-host", flags.max_connections_per_host,
-        "Most connections of one host");
+  app.add_option("--max-connections-per-host", flags.max_connections_per_host,
+                 "Most connections of one host; 0: 512 with TLS, 4096 without")
+      ->check(CLI::Range(uint64_t{0}, uint64_t{1} << 62))
+      ->capture_default_str();
   limit("--network-memory-mib", flags.network_memory_mib,
         "Memory for what connections send, together; beyond it calls are ended, to be tried again");
   limit("--max-calls-per-second", flags.max_calls_per_second, "Of a client; with TLS only");
@@ -139,6 +141,10 @@ absl::StatusOr<GrpcServerOptions> ServerOptionsOf(const ServerFlags& flags) {
   options.revoked_file = in_folder(flags.revoked, "revoked");
   options.max_connections = flags.max_connections;
   options.max_connections_per_host = flags.max_connections_per_host;
+  // One over TLS takes some 80 KiB, which a stranger's does, too; in the clear 20.
+  if (options.max_connections_per_host == 0) {
+    options.max_connections_per_host = options.tls ? 512 : 4096;
+  }
   options.calls_per_second = static_cast<double>(flags.max_calls_per_second);
   options.network_bytes = flags.network_memory_mib << 20;
   options.max_jobs_per_client = flags.max_jobs_per_client;

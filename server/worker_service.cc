@@ -64,9 +64,9 @@ class WorkerServiceImpl final : public WorkerServiceBase {
   grpc::Status Register(grpc::ServerContext* context, const v1::RegisterRequest* request,
                         v1::RegisterResponse* response) override {
     return ToGrpc([&]() -> absl::Status {
-      FP_RETURN_IF_ERROR(AgreeOnProtocol(request->oldest_protocol_version(),
-                                         request->protocol_version(), "worker")
-                             .status());
+      FP_RETURN_IF_ERROR(
+          AgreeOnProtocol(request->oldest_protocol_version(), request->protocol_version(), "worker")
+              .status());
       FP_ASSIGN_OR_RETURN(WorkerHello hello, HelloFromWire(*request));
       if (hello.name.empty()) hello.name = context->peer();
       FP_ASSIGN_OR_RETURN(const WorkerWelcome welcome, coordinator_.Register(hello));

@@ -9,6 +9,8 @@
 #include "client/command_line.h"
 #include "client/frame_path.h"
 #include "client/frame_range.h"
+#include "proto/access.h"
+#include "proto/certificate.h"
 #include "proto/convert.h"
 #include "proto/farpoint.pb.h"
 #include "proto/job.h"
@@ -98,9 +100,45 @@ bool RunMessage(std::span<const std::byte> bytes) {
         if (head.ok()) FuzzRequire(head->size_bytes <= 1 << 20, "sizes are bounded");
         return head.ok();
       });
+    case 13:
+      return RunBoth<v1::DiagnoseResponse>(bytes, HealthFromWire);
+    case 14:
+      return RunOne<v1::RenderJob>(
+          bytes, [](const v1::RenderJob& wire) { return CheckFieldsKnown(wire, "job").ok(); });
     default:
       return false;
   }
+}
+
+// What a coordinator reads of its own folder, and of a stranger: tokens, revoked serials,
+// certificates.
+bool RunSecrets(std::span<const std::byte> bytes) {
+  const std::string_view text = TextOf(bytes);
+  const auto tokens = ParseTokens(text, "tokens");
+  if (tokens.ok()) {
+    std::string again;
+    for (const TokenEntry& token : *tokens) again += FormatToken(token);
+    FuzzRequire(ParseTokens(again, "again").ok(), "tokens that were read can be written and read");
+  }
+  const bool revoked = ParseRevoked(text, "revoked").ok();
+  const auto facts = ReadCertificate(text, "certificate");
+  if (facts.ok()) {
+    for (const char c : facts->name)
+      FuzzRequire(c >= ' ' && c <= '~', "names are shown and logged");
+  }
+  (void)CheckIssued(text, text, false, 1'800'000'000);
+  (void)CheckHost(text, "farm.example");
+  return tokens.ok() || revoked || facts.ok();
+}
+
+std::vector<FuzzBytes> SecretsSeeds() {
+  std::vector<FuzzBytes> seeds = {
+      BytesOf(FormatToken({TokenHash("fp_"), "carol", Role::kAdmin, 1'900'000'000})),
+      BytesOf("0badcafe alice 2026-11-22\n")};
+  if (const auto authority = MakeAuthority("farm", 1'700'000'000, 1'900'000'000); authority.ok()) {
+    seeds.push_back(BytesOf(authority->certificate));
+  }
+  return seeds;
 }
 
 template <typename Wire>
@@ -128,12 +166,16 @@ std::vector<FuzzBytes> MessageSeeds() {
   work.frame.film = {64, 48, {0, 0, 64, 48}};
   work.blobs = blobs;
   work.lease_time = std::chrono::milliseconds(1000);
+  CoordinatorHealth health;
+  health.version = "1";
+  health.caller_name = "alice";
   WorkerWelcome welcome;
   welcome.id = WorkerId{"0123456789abcdef0123456789abcdef"};
   return {Message(0, ToWire(SmallJob())),  Message(1, ToWire(status)),
           Message(5, ToWire(explanation)), Message(7, ToWire(hello)),
           Message(8, ToWire(welcome)),     Message(9, ToWire(work)),
-          Message(10, ToWire(stats)),      Message(11, ToWire(blobs))};
+          Message(10, ToWire(stats)),      Message(11, ToWire(blobs)),
+          Message(13, ToWire(health)),     Message(14, ToWire(SmallJob()))};
 }
 
 bool RunConfig(std::span<const std::byte> bytes) {
@@ -165,10 +207,9 @@ std::vector<FuzzBytes> FramesSeeds() {
 }
 
 constexpr FuzzTarget kTargets[] = {
-    {"job_file", RunJobFile, JobFileSeeds},
-    {"message", RunMessage, MessageSeeds},
-    {"config", RunConfig, ConfigSeeds},
-    {"frames", RunFrames, FramesSeeds},
+    {"job_file", RunJobFile, JobFileSeeds}, {"message", RunMessage, MessageSeeds},
+    {"config", RunConfig, ConfigSeeds},     {"frames", RunFrames, FramesSeeds},
+    {"secrets", RunSecrets, SecretsSeeds},
 };
 
 }  // namespace

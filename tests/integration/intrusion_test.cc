@@ -4,6 +4,7 @@
 #include <arpa/inet.h>
 #include <fcntl.h>
 #include <gmock/gmock.h>
+#include <grpcpp/impl/codegen/client_unary_call.h>
 #include <gtest/gtest.h>
 #include <netinet/in.h>
 #include <poll.h>
@@ -11,6 +12,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cstring>
 #include <fstream>
@@ -188,6 +190,42 @@ TEST_F(Intrusion, AThousandTlsConnectionsThatDribbleTheirHelloCostNothing) {
   Settle({Unchecked(certs, certs, "alice"), ""});
   // The head of a record of 512 bytes, of which little comes.
   HoldConnections(std::string_view("\x16\x03\x01\x02\x00", 5), "\x01\x00\x01\xfc\x03\x03");
+  ExpectUnharmed();
+}
+
+TEST_F(Intrusion, OpenTlsConnectionsOfAStrangerCostLittle) {
+  const std::string certs = MakeCerts(farm_);
+  farm_.StartServer({"--certs", certs});
+  Settle({Unchecked(certs, certs, "alice"), ""});
+  TlsMaterial stranger;
+  stranger.ca = ReadWhole(certs + "/ca.pem");
+  // 600 from one host, of which 512 are let in. Health answers strangers, too.
+  constexpr size_t kThreads = 4, kOfEach = 150;
+  std::vector<std::vector<std::shared_ptr<grpc::Channel>>> channels(kThreads);
+  std::atomic<int> answered = 0;
+  std::vector<std::thread> threads;
+  for (size_t t = 0; t < kThreads; ++t) {
+    threads.emplace_back([&, t] {
+      for (size_t i = 0; i < kOfEach; ++i) {
+        const auto channel = OpenChannel(farm_.address(), {stranger, ""}, /*own_connection=*/true);
+        grpc::ClientContext context;
+        SetDeadline(context, milliseconds(10000));
+        const v1::CancelRequest nothing;
+        v1::CancelResponse answer;
+        const grpc::internal::RpcMethod check("/grpc.health.v1.Health/Check",
+                                              grpc::internal::RpcMethod::NORMAL_RPC);
+        const grpc::Status status =
+            grpc::internal::BlockingUnaryCall<v1::CancelRequest, v1::CancelResponse>(
+                channel.get(), check, &context, nothing, &answer);
+        answered += status.ok() ? 1 : 0;
+        channels[t].push_back(channel);
+      }
+    });
+  }
+  for (std::thread& thread : threads) thread.join();
+  EXPECT_GE(answered, 400);
+  channels.clear();
+  EXPECT_TRUE(WaitUntil(seconds(30), [&] { return Status().ok(); })) << farm_.Logs();
   ExpectUnharmed();
 }
 

@@ -230,6 +230,76 @@ TEST(CommandLine, Compare) {
               AllOf(StartsWith("--diff d.jpg: "), HasSubstr(".png")));
 }
 
+TEST(CommandLine, CertificatesAndTokens) {
+  const CommandLine init =
+      Parse({"certs", "init", "--dir", "d", "--server", "a,10.0.0.1", "--workers", "4", "--clients",
+             "x,y", "--clients", "z", "--days", "30"});
+  EXPECT_EQ(init.verb, Verb::kCerts);
+  EXPECT_EQ(init.certs_action, CertsAction::kInit);
+  EXPECT_EQ(init.certs_directory, "d");
+  EXPECT_THAT(init.certs_hosts, ElementsAre("a", "10.0.0.1"));
+  EXPECT_EQ(init.workers, 4u);
+  EXPECT_THAT(init.certs_clients, ElementsAre("x", "y", "z"));
+  EXPECT_EQ(init.certs_days, 30u);
+  const CommandLine add = Parse({"certs", "add", "w9", "--role", "worker"});
+  EXPECT_EQ(add.certs_action, CertsAction::kAdd);
+  EXPECT_EQ(add.certs_name, "w9");
+  EXPECT_EQ(add.certs_role, Role::kWorker);
+  EXPECT_EQ(add.certs_directory, "farpoint-certs");
+  EXPECT_EQ(Parse({"certs", "add", "s2", "--server", "h"}).certs_role, Role::kServer);
+  EXPECT_EQ(Parse({"certs", "token", "t"}).certs_action, CertsAction::kToken);
+  EXPECT_EQ(Parse({"certs", "revoke", "t"}).certs_action, CertsAction::kRevoke);
+  EXPECT_EQ(Parse({"certs", "show"}).certs_action, CertsAction::kShow);
+  EXPECT_THAT(Refusal({"certs"}), HasSubstr("ACTION"));
+  EXPECT_THAT(Refusal({"certs", "make"}), HasSubstr("unknown action"));
+  EXPECT_THAT(Refusal({"certs", "add"}), HasSubstr("NAME"));
+  EXPECT_THAT(Refusal({"certs", "show", "x"}), HasSubstr("one argument too many"));
+  EXPECT_THAT(Refusal({"certs", "token", "x", "--role", "worker"}), HasSubstr("--role"));
+  EXPECT_THAT(Refusal({"certs", "add", "x", "--role", "king"}), HasSubstr("--role king"));
+  EXPECT_THAT(Refusal({"certs", "add", "x", "--role", "worker", "--server", "h"}),
+              HasSubstr("--server"));
+  EXPECT_THAT(Refusal({"certs", "init", "--days", "0"}), HasSubstr("--days"));
+}
+
+TEST(CommandLine, EveryCommandThatAsksACoordinatorSpeaksTls) {
+  for (const std::vector<std::string>& command : {std::vector<std::string>{"status"},
+                                                  {"watch"},
+                                                  {"workers"},
+                                                  {"logs", "1"},
+                                                  {"explain", "1"},
+                                                  {"cancel", "1"},
+                                                  {"fetch", "1", "-o", "x.exr"},
+                                                  {"submit", "a.glb", "-o", "x.exr"},
+                                                  {"doctor"}}) {
+    std::vector<std::string> args = command;
+    args.insert(args.end(), {"--coordinator", "h:1", "--tls-ca", "c", "--tls-cert", "p",
+                             "--tls-key", "k", "--token-file", "t", "--insecure"});
+    const CommandLine line = Parse(args);
+    EXPECT_EQ(line.tls.paths.ca, "c") << command[0];
+    EXPECT_EQ(line.tls.paths.certificate, "p");
+    EXPECT_EQ(line.tls.paths.key, "k");
+    EXPECT_EQ(line.token_file, "t");
+    EXPECT_TRUE(line.tls.insecure);
+    args = command;
+    args.insert(args.end(), {"--coordinator", "h:1", "--certs", "dir"});
+    EXPECT_EQ(Parse(args).tls.directory, "dir");
+  }
+}
+
+TEST(CommandLine, TheDoctorNeedsNothing) {
+  const CommandLine bare = Parse({"doctor"});
+  EXPECT_EQ(bare.verb, Verb::kDoctor);
+  EXPECT_EQ(bare.coordinator, "");
+  const CommandLine line =
+      Parse({"doctor", "a.glb", "--role", "worker", "--store", "s", "--cache", "c", "--blob-dir",
+             "b", "--listen", "h:1", "--points", "5000000000"});
+  EXPECT_EQ(line.scene, "a.glb");
+  EXPECT_EQ(line.doctor_role, Role::kWorker);
+  EXPECT_EQ(line.store + line.cache + line.blob_dir + line.listen, "scbh:1");
+  EXPECT_EQ(line.points, 5'000'000'000u);
+  EXPECT_THAT(Refusal({"doctor", "--coordinator", "nowhere"}), HasSubstr("--coordinator"));
+}
+
 TEST(CommandLine, HelpAndVersionPrintAndNeedNothingElse) {
   for (const char* verb :
        {"render", "submit", "status", "watch", "fetch", "pause", "resume", "cancel", "requeue",
