@@ -118,9 +118,11 @@ Digest BakeKey(const JobSpec& spec) {
   relevant.overrides = spec.overrides;
   relevant.light_units = spec.light_units;
   relevant.settings = spec.settings;
-  // What only tiles need. fpbgi, pbgi and dpbgi share surfels and tree; pt and irrcache have none.
+  // What only tiles need. pt and irrcache have no surfels; the others share surfels and tree, but
+  // for how many there are by default.
   RenderSettings& s = relevant.settings;
   const RenderSettings any;
+  const bool fewer = s.points == 0 && s.reads_surfels_by_rays();
   s.integrator = s.point_based() ? any.integrator : Integrator::kPt;
   s.spp = any.spp;
   s.filter = any.filter;
@@ -130,7 +132,7 @@ Digest BakeKey(const JobSpec& spec) {
   s.buffer_map = any.buffer_map;
   s.splat = any.splat;
   s.clusters = any.clusters;
-  s.fill = any.fill;
+  s.fill = fewer || !s.point_based() ? any.fill : Fill::kCut;
   s.quality = any.quality;
   s.cache_error = any.cache_error;
   s.cache_samples = any.cache_samples;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <span>
 
@@ -409,7 +410,7 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
             lanes - static_cast<uint32_t>(std::popcount(rays[i].active));
       }
       for (size_t i = 0; i < count; ++i) {
-        Trace(rays[i], counters);
+        Trace(rays[i], false, counters);
         irradiance[first + i] = irradiance[first + i] + rays[i].arriving;
       }
     }
@@ -635,7 +636,7 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
       const auto k = static_cast<size_t>(std::countr_zero(rest));
       Skip(q, rays.direction[k], rays.reach_m[k], counters);
     }
-    Trace(rays, counters);
+    Trace(rays, true, counters);
     for (uint32_t k = 0; k < count; ++k) sum += rays.arriving.Lane(k);
   }
   return sum / static_cast<float>(q.samples);
@@ -709,15 +710,14 @@ LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) co
   return rays;
 }
 
-void LightSampler::Trace(ShadowRays8& rays, LightCounters& counters) const {
-  unsigned blocked = 0;
-  for (unsigned rest = rays.active; rest != 0; rest &= rest - 1) {
-    const auto k = static_cast<size_t>(std::countr_zero(rest));
-    if (!(rays.reach_m[k] > 0.0f)) continue;
-    if (accel_->Occluded(rays.origin[k], rays.direction[k], rays.reach_m[k])) {
-      blocked |= 1u << k;
-    }
-  }
+void LightSampler::Trace(ShadowRays8& rays, bool from_one_point, LightCounters& counters) const {
+  const FpTrapPause pause;  // lanes that are left out
+  const unsigned active = rays.active & Bits8(rays.reach_m > Set8(0.0f));
+  std::array<float, LightTree::kWidth> reach_m;
+  std::memcpy(reach_m.data(), &rays.reach_m, sizeof(reach_m));
+  const unsigned blocked =
+      active == 0 ? 0
+                  : accel_->Occluded8(rays.origin, rays.direction, reach_m, active, from_one_point);
   counters.rays += static_cast<uint32_t>(std::popcount(rays.active));
   counters.blocked += static_cast<uint32_t>(std::popcount(blocked));
   rays.arriving = Select8(Mask8(blocked), V8(Vec3f()), rays.arriving);

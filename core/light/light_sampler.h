@@ -179,8 +179,8 @@ class LightSampler {
     unsigned active;
   };
   ShadowRays8 RaysTo(const EmitterSamples& samples) const;
-  // Traces the rays: nothing arrives where they are blocked.
-  void Trace(ShadowRays8& rays, LightCounters& counters) const;
+  // Traces the rays: nothing arrives where they are blocked. `from_one_point`: all have one origin.
+  void Trace(ShadowRays8& rays, bool from_one_point, LightCounters& counters) const;
   // One sample for each point.
   EmitterSamples SampleEach(const SurfacePoints8& points, uint64_t key, unsigned dimension) const;
 

@@ -470,10 +470,11 @@ float SurfelSpacingM(const SurfaceSize& size, uint64_t count) {
   return RoundedSpacingM(size, static_cast<double>(count), 7);
 }
 
-float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t most) {
+float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t least,
+                            uint64_t most) {
   const double edge = static_cast<double>(diagonal_m) / 500.0;
   const double n = std::min(edge > 0 ? size.area_m2 / (edge * edge) : 0, static_cast<double>(most));
-  return RoundedSpacingM(size, std::clamp(n, 1e5, 4e6), 3);
+  return RoundedSpacingM(size, std::clamp(n, static_cast<double>(least), 4e6), 3);
 }
 
 SurfelCloud PlaceSurfels(const PreparedScene& prepared, std::span<const ObjectShape> shapes,

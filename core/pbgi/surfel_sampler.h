@@ -26,9 +26,10 @@ namespace farpoint {
 float SurfelSpacingM(const SurfaceSize& size, uint64_t count);
 
 // The spacing when the user names no count: one surfel for each square of edge diagonal/500, but no
-// more than `most`, between 100,000 and 4,000,000, rounded to 3 bits in the same unit. Depends on
+// more than `most`, between `least` and 4,000,000, rounded to 3 bits in the same unit. Depends on
 // the scene only, never on the camera.
-float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t most);
+float DefaultSurfelSpacingM(const SurfaceSize& size, float diagonal_m, uint64_t least,
+                            uint64_t most);
 
 // Where the surfels of one object lie on it. All of one length. Neighbours in the order are
 // neighbours in space: cubes of 16 spacings along a Morton curve.

@@ -101,10 +101,14 @@ float SpacingFor(const RenderSettings& settings, const SurfaceSize& size,
   if (settings.points != 0) return SurfelSpacingM(size, settings.points);
   // Where light is soft and faces are large, light is smooth. A map may hold a sun.
   constexpr uint64_t kMostPerTriangle = 64;
-  const bool sharp = !prepared.lights().empty() || prepared.has_environment_map();
-  return DefaultSurfelSpacingM(
-      size, prepared.diagonal_m(),
-      sharp ? ~uint64_t{0} : kMostPerTriangle * prepared.triangles().size());
+  constexpr uint64_t kLeast = 100'000, kLeastOfSoftRays = 20'000;
+  if (!prepared.lights().empty() || prepared.has_environment_map()) {
+    return DefaultSurfelSpacingM(size, prepared.diagonal_m(), kLeast, ~uint64_t{0});
+  }
+  // Rays shade what lies nearer than two spacings; a cut has nothing but the surfels.
+  const uint64_t least = settings.reads_surfels_by_rays() ? kLeastOfSoftRays : kLeast;
+  return DefaultSurfelSpacingM(size, prepared.diagonal_m(), least,
+                               kMostPerTriangle * prepared.triangles().size());
 }
 
 // The stages after the prepared scene.

@@ -87,6 +87,8 @@ struct RenderSettings {
   uint32_t cache_samples_in_force() const;
   bool adaptive() const { return integrator == Integrator::kFpbgi && clusters == 0; }
   Fill fill_in_force() const;
+  // Whether surfels are read where rays end, and not seen as discs.
+  bool reads_surfels_by_rays() const { return adaptive() && fill_in_force() == Fill::kRays; }
   float filter_width() const;  // pixels
   bool skips(SkipMask item) const { return !no_skip && (computed & item) == 0; }
 };

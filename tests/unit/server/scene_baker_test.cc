@@ -66,6 +66,23 @@ TEST(BakeKey, IsBlindToCameraFilmAndTiles) {
   EXPECT_EQ(BakeKey(job), BakeKey(SmallJob()));
 }
 
+// What is read by rays needs fewer surfels than what is seen as discs, unless the user says how
+// many.
+TEST(BakeKey, TellsTheDefaultNumbersOfSurfelsApart) {
+  JobSpec rays = SmallJob();
+  ASSERT_TRUE(rays.settings.reads_surfels_by_rays());
+  JobSpec discs = rays, cuts = rays, clusters = rays;
+  discs.settings.integrator = Integrator::kPbgi;
+  cuts.settings.fill = Fill::kCut;
+  clusters.settings.clusters = 64;
+  for (const uint64_t points : {uint64_t{0}, uint64_t{5000}}) {
+    for (JobSpec* job : {&rays, &discs, &cuts, &clusters}) job->settings.points = points;
+    EXPECT_EQ(BakeKey(discs), BakeKey(cuts));
+    EXPECT_EQ(BakeKey(discs), BakeKey(clusters));
+    EXPECT_EQ(BakeKey(discs) == BakeKey(rays), points != 0);
+  }
+}
+
 TEST(BakeKey, OfAnAnimatedSceneChangesWithTime) {
   const JobSpec job = SmallJob();
   const Digest rest = BakeKeyAt(job, std::nullopt);

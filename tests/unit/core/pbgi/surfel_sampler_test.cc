@@ -341,13 +341,16 @@ TEST(SurfelSpacing, ChangesInSteps) {
                     static_cast<float>(scale) * SurfelSpacingM({4, 3}, 10000));
   }
   // 500 squares along the diagonal, within the limits.
-  constexpr uint64_t kAny = ~uint64_t{0};
-  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, kAny), 0.759 / 500, 0.07 * 0.759 / 500);
-  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, 125'000), 0.759 / 250, 0.07 * 0.759 / 250);
-  EXPECT_NEAR(DefaultSurfelSpacingM({0.001, 0.001}, 1, kAny), 0.759 * std::sqrt(0.001 / 1e5),
-              2e-5 * 0.8);
-  EXPECT_NEAR(DefaultSurfelSpacingM({1, 1}, 1, 7), 0.759 * std::sqrt(1 / 1e5), 0.07 * 0.0024);
-  EXPECT_EQ(DefaultSurfelSpacingM({}, 0, kAny), 0);
+  constexpr uint64_t kAny = ~uint64_t{0}, kLeast = 100'000;
+  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, kLeast, kAny), 0.759 / 500, 0.07 * 0.759 / 500);
+  EXPECT_NEAR(DefaultSurfelSpacingM({2, 2}, 1, kLeast, 125'000), 0.759 / 250, 0.07 * 0.759 / 250);
+  EXPECT_NEAR(DefaultSurfelSpacingM({0.001, 0.001}, 1, kLeast, kAny),
+              0.759 * std::sqrt(0.001 / 1e5), 2e-5 * 0.8);
+  EXPECT_NEAR(DefaultSurfelSpacingM({1, 1}, 1, kLeast, 7), 0.759 * std::sqrt(1 / 1e5),
+              0.07 * 0.0024);
+  EXPECT_NEAR(DefaultSurfelSpacingM({1, 1}, 1, 10'000, 7), 0.759 * std::sqrt(1 / 1e4),
+              0.07 * 0.0076);
+  EXPECT_EQ(DefaultSurfelSpacingM({}, 0, kLeast, kAny), 0);
 }
 
 }  // namespace
