@@ -340,7 +340,7 @@ TEST_F(Intrusion, TinyMessagesWithoutNumberTakeNoMemory) {
   SetDeadline(context, milliseconds(120000));
   v1::PutBlobResponse response;
   const auto writer = v1::BlobService::NewStub(channel_)->Put(&context, &response);
-  constexpr int kMessages = 100'000;
+  constexpr int kMessages = 1'000'000;
   v1::PutBlobChunk chunk;
   chunk.set_sha256(Sha256().Update(std::string(kMessages, 'x')).Finish().Hex());
   chunk.set_size_bytes(kMessages);
