@@ -32,6 +32,7 @@ absl::StatusOr<std::shared_ptr<const RenderedScene>> TileRunner::SceneOf(
                                   [&](const CachedScene& c) { return c.blobs == blobs; });
   if (known != scenes_.end()) {
     scenes_.splice(scenes_.begin(), scenes_, known);
+    ++stats.skipped["scene_broadcasts"];
     return scenes_.front().scene;
   }
   // Room first: two large scenes at a time may be more than the memory holds.

@@ -17,9 +17,8 @@ constexpr uint32_t kWorthwhile = 16;
 // A sorted cut is drawn in pieces; before each it is found out what is closed. The first piece, and
 // how much longer the next one is.
 constexpr size_t kFirstPiece = 1024;
-// Where less than one node in so many is hidden, the next kIdleViews do not ask.
-constexpr size_t kLeastPart = 8;
-constexpr int kIdleViews = 31;
+// Views that do not ask after one of which little was hidden, doubled each time up to a limit.
+constexpr int kIdleViews = 31, kMostIdleViews = 255;
 
 // Copies the nodes of `cut` that touch open pixels to `out`, which has room for them and eight
 // more. `cut` may be read up to eight bytes beyond its end. The number of those.
@@ -99,7 +98,11 @@ size_t CutDrawer::DrawSorted(const CutView& view, Microbuffer& buffer, RasterCou
 void CutDrawer::Learn(size_t nodes, size_t left_out, uint64_t subtrees) {
   // A subtree is worth many nodes.
   const size_t saved = left_out + 16 * static_cast<size_t>(subtrees);
-  idle_ = saved * kLeastPart < nodes + 16 * static_cast<size_t>(subtrees) ? kIdleViews : 0;
+  const size_t all = nodes + 16 * static_cast<size_t>(subtrees);
+  next_idle_ = saved * kWorthwhilePart < all
+                   ? std::clamp(2 * next_idle_ + 1, kIdleViews, kMostIdleViews)
+                   : 0;
+  idle_ = next_idle_;
 }
 
 }  // namespace farpoint

@@ -21,6 +21,9 @@ struct HiddenCounters {
 // One thread; one object serves many views, without allocating once it is warm.
 class CutDrawer {
  public:
+  // Asking pays where at least one node in so many is hidden.
+  static constexpr size_t kWorthwhilePart = 8;
+
   // Parts of the work, for whoever measures.
   enum class Part { kCut, kRaster };
 
@@ -78,7 +81,7 @@ class CutDrawer {
   const Splat splat_;
   ShellCut shells_;
   std::optional<ClosedPixels> closed_;
-  int idle_ = 0;  // views to come for which nothing is asked
+  int idle_ = 0, next_idle_ = 0;  // views to come for which nothing is asked
   std::vector<CutNode> cut_, scratch_;
 };
 

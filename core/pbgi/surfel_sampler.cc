@@ -520,10 +520,15 @@ SurfelCloud PlaceSurfels(const PreparedScene& prepared, std::span<const ObjectSh
 SurfelCloud SampleSurfels(const Scene& scene, const PreparedScene& prepared, uint64_t count,
                           uint64_t seed, Executor& executor) {
   const std::vector<ObjectShape> shapes = MakeObjectShapes(scene, prepared, executor);
-  const float spacing_m = SurfelSpacingM(SizeOf(shapes), count);
+  const std::vector<uint8_t> repeated = RepeatedObjects(prepared, executor);
+  const float spacing_m = SurfelSpacingM(SizeOf(shapes, repeated), count);
   if (!(spacing_m > 0)) return {};
   std::vector<std::shared_ptr<const ObjectSurfels>> surfels(shapes.size());
   executor.ForEach(shapes.size(), 1, [&](size_t i) {
+    if (repeated[i] != 0) {
+      surfels[i] = std::make_shared<const ObjectSurfels>();
+      return;
+    }
     surfels[i] = std::make_shared<const ObjectSurfels>(
         ObjectSampler(shapes[i], prepared, i, spacing_m, seed, executor).Sample());
   });

@@ -75,8 +75,8 @@ SurfelCloud PlaceSurfels(const PreparedScene& prepared, std::span<const ObjectSh
                          std::span<const std::shared_ptr<const ObjectSurfels>> surfels,
                          Executor& executor);
 
-// All of the above: about `count` surfels on the whole scene. `prepared` was made by Prepare from
-// `scene`.
+// All of the above: about `count` surfels on the whole scene, none on repeated objects. `prepared`
+// was made by Prepare from `scene`.
 SurfelCloud SampleSurfels(const Scene& scene, const PreparedScene& prepared, uint64_t count,
                           uint64_t seed, Executor& executor);
 

@@ -3,10 +3,12 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <numeric>
 #include <span>
 
 #include "core/base/check.h"
 #include "core/base/fp_trap.h"
+#include "core/math/sampling.h"
 
 namespace farpoint {
 
@@ -176,13 +178,60 @@ std::vector<ObjectShape> MakeObjectShapes(const Scene& scene, const PreparedScen
   return shapes;
 }
 
-SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes) {
+SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes, const std::vector<uint8_t>& repeated) {
+  FP_CHECK(shapes.size() == repeated.size());
   SurfaceSize size;
-  for (const ObjectShape& shape : shapes) {
-    size.area_m2 += shape.area_m2();
-    size.largest_m2 = std::max(size.largest_m2, shape.area_m2());
+  for (size_t i = 0; i < shapes.size(); ++i) {
+    if (repeated[i] != 0) continue;
+    size.area_m2 += shapes[i].area_m2();
+    size.largest_m2 = std::max(size.largest_m2, shapes[i].area_m2());
   }
   return size;
+}
+
+std::vector<uint8_t> RepeatedObjects(const PreparedScene& prepared, Executor& executor) {
+  const auto objects = prepared.objects();
+  const auto corner = [&](uint64_t triangle, int k) -> const Vec3f& {
+    return prepared.vertices()[prepared.triangles()[triangle].vertex[static_cast<size_t>(k)]];
+  };
+  // Those that may be the same lie in the same box and have as many triangles.
+  std::vector<uint64_t> keys(objects.size());
+  executor.ForEach(objects.size(), 16, [&](size_t o) {
+    Box3f box;
+    const PreparedObject& object = objects[o];
+    for (uint64_t t = 0; t < object.triangle_count; ++t) {
+      for (int k = 0; k < 3; ++k) box.Extend(corner(object.first_triangle + t, k));
+    }
+    uint64_t key = object.triangle_count;
+    for (int c = 0; c < 3; ++c) {
+      key = HashKey(key, std::bit_cast<uint32_t>(box.min[c]), std::bit_cast<uint32_t>(box.max[c]));
+    }
+    keys[o] = key;
+  });
+  std::vector<uint32_t> order(objects.size());
+  std::iota(order.begin(), order.end(), 0u);
+  std::sort(order.begin(), order.end(),
+            [&](uint32_t a, uint32_t b) { return keys[a] != keys[b] ? keys[a] < keys[b] : a < b; });
+  const auto same = [&](const PreparedObject& a, const PreparedObject& b) {
+    if (a.triangle_count != b.triangle_count) return false;
+    for (uint64_t t = 0; t < a.triangle_count; ++t) {
+      for (int k = 0; k < 3; ++k) {
+        if (!(corner(a.first_triangle + t, k) == corner(b.first_triangle + t, k))) return false;
+      }
+    }
+    return true;
+  };
+  std::vector<uint8_t> repeated(objects.size(), 0);
+  for (size_t i = 0; i < order.size(); ++i) {
+    // Against those before it that are no repetitions themselves; few share a key.
+    for (size_t j = i; j-- > 0 && keys[order[j]] == keys[order[i]] && repeated[order[i]] == 0;) {
+      const bool holes = prepared.materials()[objects[order[j]].material].alpha_cutoff >= 0.0f;
+      if (repeated[order[j]] == 0 && !holes && same(objects[order[i]], objects[order[j]])) {
+        repeated[order[i]] = 1;
+      }
+    }
+  }
+  return repeated;
 }
 
 }  // namespace farpoint

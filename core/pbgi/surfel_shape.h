@@ -35,6 +35,10 @@ struct ObjectShape {
 ObjectShape MakeObjectShape(const Scene& scene, const PreparedScene& prepared, size_t object,
                             uint32_t first_vertex);
 
+// By object: 1 if it lies where an earlier one without holes does, triangle for triangle to the
+// last bit. Light sees one of the two only; surfels of both would block and shine twice.
+std::vector<uint8_t> RepeatedObjects(const PreparedScene& prepared, Executor& executor);
+
 // The shapes of all objects, in parallel.
 std::vector<ObjectShape> MakeObjectShapes(const Scene& scene, const PreparedScene& prepared,
                                           Executor& executor);
@@ -43,6 +47,7 @@ struct SurfaceSize {
   double area_m2 = 0;     // of all objects, summed in their order
   double largest_m2 = 0;  // of the object that has most
 };
-SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes);
+// Without those that are repeated.
+SurfaceSize SizeOf(const std::vector<ObjectShape>& shapes, const std::vector<uint8_t>& repeated);
 
 }  // namespace farpoint

@@ -1,5 +1,6 @@
 #include "core/render/bake.h"
 
+#include <algorithm>
 #include <chrono>
 #include <memory>
 #include <span>
@@ -160,11 +161,15 @@ class TreeBake {
   void FindKeys() {
     StageTimer timer(stats_, Stage::kSample);
     shapes_ = MakeObjectShapes(scene_, *prepared_, executor_);
-    spacing_m_ = options_.surfel_spacing_m > 0 ? options_.surfel_spacing_m
-                                               : SpacingFor(settings_, SizeOf(shapes_), *prepared_);
+    repeated_ = RepeatedObjects(*prepared_, executor_);
+    for (const uint8_t r : repeated_) stats_.skipped["objects_repeated"] += r;
+    spacing_m_ = options_.surfel_spacing_m > 0
+                     ? options_.surfel_spacing_m
+                     : SpacingFor(settings_, SizeOf(shapes_, repeated_), *prepared_);
     if (spacing_m_ > 0) {
       samplers_.resize(shapes_.size());
       executor_.ForEach(shapes_.size(), 1, [&](size_t i) {
+        if (repeated_[i] != 0) return;
         samplers_[i] = std::make_unique<ObjectSampler>(shapes_[i], *prepared_, i, spacing_m_,
                                                        settings_.seed, executor_);
       });
@@ -172,7 +177,7 @@ class TreeBake {
     if (cache_ == nullptr) return;
     Sha256 topology;
     topology.Update("topology").UpdateU64(settings_.seed).UpdateU64(samplers_.size());
-    for (const auto& sampler : samplers_) HashDigest(topology, sampler->key());
+    for (const auto& sampler : samplers_) HashDigest(topology, sampler ? sampler->key() : Digest());
     HashDigest(topology, GeometryKey(scene_, *prepared_));
     topology_key_ = topology.Finish();
     Sha256 radiance;
@@ -247,6 +252,10 @@ class TreeBake {
     std::vector<std::shared_ptr<const ObjectSurfels>> surfels(samplers_.size());
     std::vector<uint8_t> kept(samplers_.size(), 0);
     executor_.ForEach(samplers_.size(), 1, [&](size_t i) {
+      if (!samplers_[i]) {
+        surfels[i] = std::make_shared<const ObjectSurfels>();
+        return;
+      }
       const Digest& key = samplers_[i]->key();
       if (cache_ != nullptr) surfels[i] = cache_->Find<ObjectSurfels>(key);
       kept[i] = surfels[i] != nullptr;
@@ -264,7 +273,10 @@ class TreeBake {
     if (objects > 0) {
       stats_.skipped["objects_kept"] += objects;
       stats_.skipped["surfels_kept"] += kept_surfels;
-      if (objects == kept.size()) ++stats_.skipped["bake_stages"];
+      const auto repeated = std::count(repeated_.begin(), repeated_.end(), uint8_t{1});
+      if (objects + static_cast<uint64_t>(repeated) == kept.size()) {
+        ++stats_.skipped["bake_stages"];
+      }
     }
     return PlaceSurfels(*prepared_, shapes_, surfels, executor_);
   }
@@ -278,8 +290,9 @@ class TreeBake {
   Stats& stats_;
 
   std::vector<ObjectShape> shapes_;
+  std::vector<uint8_t> repeated_;  // by object
   float spacing_m_ = 0;
-  std::vector<std::unique_ptr<ObjectSampler>> samplers_;  // by object; none if nothing to sample
+  std::vector<std::unique_ptr<ObjectSampler>> samplers_;  // by object; none for what has none
   Digest topology_key_, radiance_key_;
 };
 
@@ -308,7 +321,10 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
 absl::StatusOr<float> SurfelSpacing(const Scene& scene, const RenderSettings& settings,
                                     Executor& executor) {
   FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(scene, executor));
-  return SpacingFor(settings, SizeOf(MakeObjectShapes(scene, *prepared, executor)), *prepared);
+  return SpacingFor(
+      settings,
+      SizeOf(MakeObjectShapes(scene, *prepared, executor), RepeatedObjects(*prepared, executor)),
+      *prepared);
 }
 
 }  // namespace farpoint

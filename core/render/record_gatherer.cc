@@ -256,11 +256,19 @@ RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& r
       map_(map),
       cut_params_(cut_params),
       sees_sky_(sees_sky) {
+  hide_ = settings.skips(kSkipHidden);
   if (settings.point_based() && settings.fill_in_force() == Fill::kRays && scene.tree != nullptr &&
       !scene.tree->empty()) {
     atlas_ = &scene.Atlas();
     near_m_ = kNearSpacings * atlas_->spacing_m();
   }
+}
+
+void RecordGatherer::Refine(const Means& deviation) {
+  least_share_ = deviation;
+  const std::lock_guard lock(mutex_);
+  hide_ = hide_ &&
+          stats_.skipped["nodes_hidden"] * CutDrawer::kWorthwhilePart >= stats_.counts["cut_nodes"];
 }
 
 bool RecordGatherer::ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const {
@@ -456,7 +464,7 @@ GatherRecord RecordGatherer::GatherByCut(const Receiver& receiver,
   RasterCounters raster_counters;
   HiddenCounters hidden_counters;
   double clock = start, cut_s = 0;
-  CutDrawer drawer(tree, map_, cut_params_, settings_.splat, settings_.skips(kSkipHidden));
+  CutDrawer drawer(tree, map_, cut_params_, settings_.splat, hide_);
   const size_t cut_nodes = drawer.Draw(view, nullptr, buffer, cut_counters, raster_counters,
                                        hidden_counters, [&](CutDrawer::Part part) {
                                          const double now = ThreadCpuSeconds();

@@ -35,9 +35,10 @@ class RecordGatherer final : public PlaceSource {
   };
   // Rounded to quarters of an octave, so that they are the same in most frames of a sequence.
   Means MeanOf(const PixelRect& frame, Executor& executor) const;
-  // From now on strata are refined down to these standard deviations; 0: not for its sake. Not to
-  // be called while others gather.
-  void Refine(const Means& deviation) { least_share_ = deviation; }
+  // From now on strata are refined down to these standard deviations; 0: not for its sake. And
+  // cuts leave out what is hidden only if that was worth its while so far. Not to be called while
+  // others gather.
+  void Refine(const Means& deviation);
 
   bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
   bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override;
@@ -60,6 +61,7 @@ class RecordGatherer final : public PlaceSource {
   const bool sees_sky_;
   const SurfelAtlas* atlas_ = nullptr;  // null: shade every hit
   Means least_share_;                   // of standard deviation, for a ray more; 0: none
+  bool hide_ = true;                    // leave out of cuts what is hidden
   float near_m_ = 0;                    // hits nearer than this are shaded afresh
   mutable std::mutex mutex_;
   mutable Stats stats_;

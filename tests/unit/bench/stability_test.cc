@@ -36,8 +36,6 @@ constexpr Known kKnown[] = {
     // Sides that only someone inside a closed object sees are left out of the gather.
     {"lights-on-surfaces", "pbgi", "a light inside the tall box"},
     {"cameras-in-walls", "pbgi", "inside the tall box: largest"},
-    // Coverage of two layers in one place is added up.
-    {"duplicates", "pbgi", "all surfaces twice"},
     // 2,500 surfels leave gaps.
     {"thin-wall", "pbgi", "a wall of"},
 };

@@ -89,14 +89,18 @@ TEST_F(TileRunnerTest, FramesOfAnAnimationShareAScene) {
   const FakeRenderer renderer;
   TileRunner runner(renderer, source_, executor_, 1);
   // Nothing but the camera moves: the blobs are the same.
+  uint64_t skipped = 0;
   for (const uint32_t frame : {0u, 0u, 1u, 1u, 0u}) {
     TileWork work = Work("j", "scene", {0, 0, 32, 32});
     work.frame_index = frame;
-    ASSERT_TRUE(runner.Run(work, progress_, cancel_).ok());
+    auto result = runner.Run(work, progress_, cancel_);
+    ASSERT_TRUE(result.ok());
+    skipped += result->stats.skipped["scene_broadcasts"];
   }
   EXPECT_EQ(renderer.frames.load(), 3);
   EXPECT_EQ(renderer.loads.load(), 1);
   EXPECT_EQ(source_.gets, 1);
+  EXPECT_EQ(skipped, 2u);
 }
 
 TEST_F(TileRunnerTest, CancelEndsDownloadsAndRenders) {

@@ -318,6 +318,36 @@ TEST(SurfelSampler, HolesOfAlphaMasksAreNoSurface) {
   EXPECT_NE(key(scene), before);
 }
 
+TEST(SurfelSampler, ObjectsInOnePlaceAreSampledOnce) {
+  const Scene scene = MakeCornellBox();
+  const SurfelCloud once = Sample(scene, 5000);
+  Scene twice = scene;
+  for (const Instance& instance : scene.instances) twice.instances.push_back(instance);
+  const SurfelCloud cloud = Sample(twice, 5000);
+  EXPECT_EQ(cloud.position, once.position);
+  EXPECT_EQ(cloud.area_m2, once.area_m2);
+  // Next to each other they are two.
+  for (size_t i = scene.instances.size(); i < twice.instances.size(); ++i) {
+    twice.instances[i].world_from_mesh.translation.y += 1e-3;
+  }
+  const SurfelCloud apart = Sample(twice, 10000);
+  EXPECT_GT(apart.size(), once.size() * 19 / 10);
+  // What has holes hides nothing.
+  Scene holes;
+  Material mask;
+  mask.alpha_mode = AlphaMode::kMask;
+  mask.base_alpha = 0.1f;
+  holes.materials = {mask, Material()};
+  for (const int32_t material : {0, 1}) {
+    Mesh mesh = JitteredSquare(1, 0);
+    mesh.material = material;
+    holes.meshes.push_back(mesh);
+    holes.instances.emplace_back();
+    holes.instances.back().mesh = static_cast<uint32_t>(material);
+  }
+  EXPECT_GT(Sample(holes, 1000).size(), 400u);
+}
+
 TEST(SurfelSampler, SmallObjectsGetAtLeastOne) {
   const Scene scene = MakeCornellBox();
   const auto prepared = Prepare(scene);
