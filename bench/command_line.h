@@ -18,7 +18,17 @@
 
 namespace farpoint {
 
-enum class BenchVerb { kPareto, kMicro, kRebake, kLights, kAccuracy, kPaper, kStability, kScale, kSkip };
+enum class BenchVerb {
+  kPareto,
+  kMicro,
+  kRebake,
+  kLights,
+  kAccuracy,
+  kPaper,
+  kStability,
+  kScale,
+  kSkip
+};
 
 struct BenchCommandLine {
   std::optional<std::string> print;  // help or version: print it and do nothing else
