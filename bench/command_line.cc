@@ -14,8 +14,6 @@ namespace farpoint {
 
 namespace {
 
-constexpr std::array<std::string_view, 1> kNotBuilt = {"service"};
-
 // "1280x1000". Sizes are checked by ValidateFilm.
 bool ParseResolution(std::string_view text, int& width, int& height) {
   const char* const end = text.data() + text.size();
@@ -66,12 +64,6 @@ void AddCommonOptions(CLI::App& app, std::string& output_dir, bool& quick) {
 absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> args) {
   BenchCommandLine line;
   line.output_dir = "out/bench";
-  if (!args.empty() &&
-      std::find(kNotBuilt.begin(), kNotBuilt.end(), args.front()) != kNotBuilt.end()) {
-    return absl::UnimplementedError("'" + args.front() +
-                                    "' is not built yet; use accuracy, paper, pareto, scale, "
-                                    "rebake, lights, micro, skip or stability");
-  }
   CLI::App app("Measures farpoint: docs/benchmarks.md explains what comes out.", "farpoint-bench");
   app.set_version_flag("--version", std::string("farpoint-bench ") + FARPOINT_VERSION);
   app.require_subcommand(1);
@@ -329,6 +321,15 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   skip->add_option("--threads", k.threads, "0: all cores; 1 disturbs the times least")
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
+  CLI::App* service =
+      app.add_subcommand("service",
+                         "Kills, cuts, lies and load on real processes; writes service.json and "
+                         "service.html");
+  AddCommonOptions(*service, line.output_dir, line.service.quick);
+  service->add_option("--case", line.service.cases, "Some of the cases, may be repeated [all]");
+  service->add_option("--seed", line.service.seed, "Of every random choice")->capture_default_str();
+  service->add_option("--bin", line.service.bin_dir,
+                      "Folder of farpoint-server, farpoint-worker and farpoint [this program's]");
 
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
@@ -343,6 +344,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                             : stability->parsed() ? stability
                             : scale->parsed()     ? scale
                             : skip->parsed()      ? skip
+                            : service->parsed()   ? service
                                                   : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -360,6 +362,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
               : stability->parsed() ? BenchVerb::kStability
               : scale->parsed()     ? BenchVerb::kScale
               : skip->parsed()      ? BenchVerb::kSkip
+              : service->parsed()   ? BenchVerb::kService
                                     : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
@@ -439,6 +442,12 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
     if (std::find(known_skips.begin(), known_skips.end(), name) == known_skips.end()) {
       return absl::InvalidArgumentError(
           Concat({"--case ", name, " is none of ", absl::StrJoin(known_skips, ", ")}));
+    }
+  }
+  for (const std::string& name : line.service.cases) {
+    if (std::find(kServiceNames.begin(), kServiceNames.end(), name) == kServiceNames.end()) {
+      return absl::InvalidArgumentError(
+          Concat({"--case ", name, " is none of ", absl::StrJoin(ServiceNames(), ", ")}));
     }
   }
   if (line.output_dir.empty()) return absl::InvalidArgumentError("-o needs the name of a folder");

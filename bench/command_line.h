@@ -12,6 +12,7 @@
 #include "bench/pareto.h"
 #include "bench/rebake.h"
 #include "bench/scale.h"
+#include "bench/service.h"
 #include "bench/skip.h"
 #include "bench/stability.h"
 #include "core/base/status.h"
@@ -27,7 +28,8 @@ enum class BenchVerb {
   kPaper,
   kStability,
   kScale,
-  kSkip
+  kSkip,
+  kService
 };
 
 struct BenchCommandLine {
@@ -42,11 +44,12 @@ struct BenchCommandLine {
   StabilityOptions stability;
   ScaleOptions scale;
   SkipOptions skip;
+  ServiceOptions service;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 
 // `args` without the program's name. Errors are for a person, one line first: kInvalidArgument for
-// a wrong command line, kUnimplemented for the benchmarks that are planned but not built yet.
+// a wrong command line.
 absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> args);
 
 }  // namespace farpoint

@@ -11,6 +11,8 @@
 #include "bench/paper_report.h"
 #include "bench/pareto_report.h"
 #include "bench/scale_report.h"
+#include "bench/service.h"
+#include "bench/service_report.h"
 #include "bench/skip_report.h"
 #include "bench/stability_report.h"
 #include "core/base/blob.h"
@@ -173,6 +175,36 @@ absl::Status Skip(const BenchCommandLine& line, std::ostream& out, std::ostream&
   return absl::OkStatus();
 }
 
+absl::Status Service(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+#ifdef FARPOINT_SERVICE
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "service.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const ServiceReport report,
+                      RunService(line.service, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_RETURN_IF_ERROR(WriteText(dir / "service.json", ServiceJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(dir / "service.html", ServiceHtml(report)));
+  out << ServiceTable(report) << "\n"
+      << (dir / "service.json").string() << "\n"
+      << (dir / "service.html").string() << "\n";
+  if (report.failures() > 0) {
+    return absl::FailedPreconditionError("service: " + std::to_string(report.failures()) +
+                                         " checks fail (the table lists them)");
+  }
+  return absl::OkStatus();
+#else
+  (void)line, (void)out, (void)err;
+  return absl::UnimplementedError(
+      "service: this farpoint-bench was built without the service; configure with "
+      "-DFARPOINT_SERVICE=ON");
+#endif
+}
+
 absl::Status Rebake(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
   FP_ASSIGN_OR_RETURN(const RebakeReport report, RunRebake(line.rebake, [&](std::string_view text) {
                         err << "farpoint-bench: " << text << std::endl;
@@ -225,6 +257,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Scale(line, out, err);
     case BenchVerb::kSkip:
       return Skip(line, out, err);
+    case BenchVerb::kService:
+      return Service(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
@@ -234,6 +268,12 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
 }  // namespace
 
 int RunBench(const std::vector<std::string>& args, std::ostream& out, std::ostream& err) {
+#ifdef FARPOINT_SERVICE
+  // A process of the service's benchmark, not for people: not in the help.
+  if (!args.empty() && args.front() == "service-actor") {
+    return RunServiceActor({args.begin() + 1, args.end()});
+  }
+#endif
   const absl::StatusOr<BenchCommandLine> line = ParseBenchCommandLine(args);
   if (!line.ok()) {
     err << "farpoint-bench: " << line.status().message() << std::endl;
@@ -246,6 +286,7 @@ int RunBench(const std::vector<std::string>& args, std::ostream& out, std::ostre
   const absl::Status status = Run(*line, out, err);
   if (!status.ok()) err << "farpoint-bench: " << status.message() << std::endl;
   out.flush();
+  if (absl::IsUnimplemented(status)) return kUsage;
   return ExitCode(status);
 }
 

@@ -8,8 +8,8 @@
 namespace farpoint {
 
 // Results go to `out` and into files, progress and errors to `err`. 0; 2: the command line is
-// wrong, or a benchmark is not built yet; 42: a scene, a reference or a setting is wrong; 75: try
-// again (as of farpoint, docs/commands.md).
+// wrong, or the benchmark is not in this build; 42: a scene, a reference or a setting is wrong; 75:
+// try again (as of farpoint, docs/commands.md).
 int RunBench(const std::vector<std::string>& args, std::ostream& out, std::ostream& err);
 
 }  // namespace farpoint

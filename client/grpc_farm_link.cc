@@ -24,6 +24,8 @@ using std::chrono::seconds;
 
 constexpr seconds kControlDeadline(20);
 constexpr seconds kDiagnoseDeadline(5);
+// How long a call waits for a connection that was lost, before it says so.
+constexpr milliseconds kReconnectTime(500);
 constexpr seconds kInfoDeadline(60);
 // A watch is renewed after so long; it then goes on where it was.
 constexpr seconds kWatchDeadline(600);
@@ -51,7 +53,8 @@ absl::Status Damaged(std::string text) {
 // The context of one call, with its deadline, cancelled when the flag is raised.
 class Call {
  public:
-  Call(seconds time, const StopFlag& stop) {
+  Call(grpc::Channel& channel, seconds time, const StopFlag& stop) {
+    AwaitConnection(channel, kReconnectTime);
     context_.set_deadline(std::chrono::system_clock::now() + time);
     // A signal handler can wake nobody, so this looks at the flag now and then.
     watcher_ = std::thread([this, &stop] {
@@ -91,7 +94,7 @@ class GrpcFarmLink final : public FarmLink {
         blobs_(v1::BlobService::NewStub(channel_)) {}
 
   absl::StatusOr<std::vector<Digest>> FindMissing(std::span<const Digest> blobs) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::FindMissingRequest request;
     for (const Digest& digest : blobs) request.add_sha256(ToWire(digest));
     v1::FindMissingResponse response;
@@ -105,7 +108,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Put(const Digest& digest, const Blob& blob) override {
-    Call call(kBulkDeadline + seconds(blob.size() / kSlowestBytesPerSecond), stop_);
+    Call call(*channel_, kBulkDeadline + seconds(blob.size() / kSlowestBytesPerSecond), stop_);
     v1::PutBlobResponse response;
     const auto writer = blobs_->Put(call.context(), &response);
     v1::PutBlobChunk chunk;
@@ -126,7 +129,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<JobId> Submit(const JobSpec& spec, const std::string& submission_id) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::SubmitRequest request;
     request.set_protocol_version(kProtocolVersion);
     request.set_oldest_protocol_version(kOldestProtocolVersion);
@@ -138,7 +141,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<FarmStatus> Status(const JobId& job) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::StatusRequest request;
     request.set_job_id(job.value);
     v1::StatusResponse response;
@@ -156,14 +159,14 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<CoordinatorHealth> Diagnose() override {
-    Call call(kDiagnoseDeadline, stop_);
+    Call call(*channel_, kDiagnoseDeadline, stop_);
     v1::DiagnoseResponse response;
     FP_RETURN_IF_ERROR(Outcome(jobs_->Diagnose(call.context(), {}, &response)));
     return HealthFromWire(response);
   }
 
   absl::Status Cancel(const JobId& job) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::CancelRequest request;
     request.set_job_id(job.value);
     v1::CancelResponse response;
@@ -171,7 +174,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Pause(const JobId& job) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::PauseRequest request;
     request.set_job_id(job.value);
     v1::PauseResponse response;
@@ -179,7 +182,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Resume(const JobId& job) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::ResumeRequest request;
     request.set_job_id(job.value);
     v1::ResumeResponse response;
@@ -187,7 +190,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status SetPriority(const JobId& job, int32_t priority) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::SetPriorityRequest request;
     request.set_job_id(job.value);
     request.set_priority(priority);
@@ -196,7 +199,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::Status Requeue(const JobId& job, bool all) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::RequeueRequest request;
     request.set_job_id(job.value);
     request.set_all(all);
@@ -205,7 +208,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<Explanation> Explain(const JobId& job) override {
-    Call call(kControlDeadline, stop_);
+    Call call(*channel_, kControlDeadline, stop_);
     v1::ExplainRequest request;
     request.set_job_id(job.value);
     v1::ExplainResponse response;
@@ -215,7 +218,7 @@ class GrpcFarmLink final : public FarmLink {
 
   absl::Status Watch(const JobId& job, uint64_t after_sequence,
                      const std::function<absl::Status(const JobEvent&)>& on_event) override {
-    Call call(kWatchDeadline, stop_);
+    Call call(*channel_, kWatchDeadline, stop_);
     v1::WatchRequest request;
     request.set_job_id(job.value);
     request.set_after_sequence(after_sequence);
@@ -238,7 +241,7 @@ class GrpcFarmLink final : public FarmLink {
   }
 
   absl::StatusOr<JobInfo> Info(const JobId& job) override {
-    Call call(kInfoDeadline, stop_);
+    Call call(*channel_, kInfoDeadline, stop_);
     v1::FetchInfoRequest request;
     request.set_job_id(job.value);
     v1::FetchInfoResponse response;
@@ -248,7 +251,7 @@ class GrpcFarmLink final : public FarmLink {
 
   absl::Status FetchTiles(const JobId& job, std::span<const uint32_t> tiles,
                           const std::function<absl::Status(TileData)>& on_tile) override {
-    Call call(kBulkDeadline * std::max<size_t>(1, tiles.size()), stop_);
+    Call call(*channel_, kBulkDeadline * std::max<size_t>(1, tiles.size()), stop_);
     v1::FetchTilesRequest request;
     request.set_job_id(job.value);
     for (const uint32_t tile : tiles) request.add_tiles(tile);

@@ -63,6 +63,8 @@ std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
   // after its restart a whole farm wants one.
   arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, security.tls ? 3000 : 1000);
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
+  // A channel has a connection of its own: what one of a process does to it is no matter of others.
+  arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
   // A farm is not reached through the proxy that a machine's browser wants.
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
   arguments.SetMaxReceiveMessageSize(kMaxResponseBytes);
@@ -75,6 +77,12 @@ absl::Status ExplainFailure(const absl::Status& status, const std::string& addre
   absl::Status found = ProbeConnection(address, security, kProbeTime);
   // A server that can be reached by now, or is just being started, is worth another try.
   return found.ok() ? status : found;
+}
+
+void AwaitConnection(grpc::Channel& channel, std::chrono::milliseconds time) {
+  const grpc_connectivity_state state = channel.GetState(/*try_to_connect=*/false);
+  if (state == GRPC_CHANNEL_READY || state == GRPC_CHANNEL_IDLE) return;
+  (void)channel.WaitForConnected(std::chrono::system_clock::now() + time);
 }
 
 void ConfigureServer(grpc::ServerBuilder& builder, size_t network_bytes) {

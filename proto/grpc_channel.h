@@ -27,6 +27,11 @@ std::shared_ptr<grpc::Channel> OpenChannel(const std::string& address,
                                            const ChannelSecurity& security = {},
                                            bool own_connection = false);
 
+// Waits up to `time` for a channel whose connection has failed; at once if it stands or was never
+// tried. gRPC goes on with an attempt to connect only while somebody waits for it, and a call on a
+// channel that failed does not wait: who only calls again and again may never be connected.
+void AwaitConnection(grpc::Channel& channel, std::chrono::milliseconds time);
+
 // What of a failed call's cause can be found out by looking: with a connection that failed
 // (kUnavailable), ProbeConnection's answer if that is worth more; else `status` as it is.
 absl::Status ExplainFailure(const absl::Status& status, const std::string& address,

@@ -20,6 +20,8 @@ constexpr std::chrono::milliseconds kCallTimeout{10000};
 constexpr std::chrono::milliseconds kRenewTimeout{3000};
 // Bulk transfers: a blob that takes longer is resumed, a tile returned again.
 constexpr std::chrono::milliseconds kStreamTimeout{600000};
+// How long a call waits for a connection that was lost, before it says so.
+constexpr std::chrono::milliseconds kReconnectTime{1000};
 // Of one Attend; then it is opened again.
 constexpr std::chrono::milliseconds kAttendTimeout{3600000};
 constexpr std::chrono::milliseconds kAttendAgain{100};
@@ -44,6 +46,7 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
   absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kCallTimeout);
     v1::RegisterResponse response;
@@ -54,6 +57,7 @@ class GrpcLinkImpl final : public GrpcLink {
 
   absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                 std::chrono::milliseconds wait) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, wait + kCallTimeout);
     v1::LeaseRequest request;
@@ -78,6 +82,7 @@ class GrpcLinkImpl final : public GrpcLink {
 
   absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
                                     const LeaseProgress& progress) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kRenewTimeout);
     v1::RenewRequest request;
@@ -94,6 +99,7 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
   absl::StatusOr<ReturnAnswer> Return(const WorkerId& worker, const TileResult& result) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kStreamTimeout);
     v1::ReturnResponse response;
@@ -117,6 +123,7 @@ class GrpcLinkImpl final : public GrpcLink {
 
   absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                              const absl::Status& error) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kCallTimeout);
     v1::ReportFailureRequest request;
@@ -156,6 +163,7 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
   absl::Status Stream(const Digest& digest, uint64_t offset_bytes, const Sink& sink) override {
+    AwaitConnection(*channel_, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kStreamTimeout);
     v1::GetBlobRequest request;

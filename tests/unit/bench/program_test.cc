@@ -71,15 +71,6 @@ TEST(BenchProgram, MicroLeavesItsReport) {
   EXPECT_EQ(nlohmann::json::parse(ReadText(folder / "micro.json"))["benchmarks"].size(), 7u);
 }
 
-TEST(BenchProgram, PlannedBenchmarksEndWithUsage) {
-  for (const char* name : {"service"}) {
-    const Ran ran = RunArgs({name});
-    EXPECT_EQ(ran.code, 2) << name;
-    EXPECT_THAT(ran.err, HasSubstr("not built yet"));
-    EXPECT_EQ(ran.out, "");
-  }
-}
-
 TEST(BenchProgram, MistakesEndWithUsage) {
   EXPECT_EQ(RunArgs({}).code, 2);
   EXPECT_EQ(RunArgs({"pareto", "--resolution", "big"}).code, 2);
