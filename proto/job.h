@@ -350,6 +350,7 @@ struct RenewAnswer {
 struct ReturnAnswer {
   bool accepted = false;
   std::string reason;
+  bool damaged = false;  // why not: the bytes are no good, not the lease; does not travel
 };
 
 struct TileResult {

@@ -6,8 +6,20 @@
 
 #include <charconv>
 #include <cstdio>
+#include <ctime>
+#include <nlohmann/json.hpp>
 
 namespace farpoint {
+
+namespace {
+
+// Set by StartLog, before other threads write.
+struct Log {
+  std::string program;
+  bool json = false;
+} g_log;
+
+}  // namespace
 
 int ServiceExitCode(const absl::Status& status) {
   switch (status.code()) {
@@ -23,8 +35,12 @@ int ServiceExitCode(const absl::Status& status) {
 }
 
 int ReportFatal(std::string_view program, const absl::Status& status) {
-  std::fprintf(stderr, "%s: %s\n", std::string(program).c_str(),
-               std::string(status.message()).c_str());
+  const std::string text(status.message());
+  if (g_log.json) {
+    WriteLog(LogLevel::kError, text);
+  } else {
+    std::fprintf(stderr, "%s: %s\n", std::string(program).c_str(), text.c_str());
+  }
   return ServiceExitCode(status);
 }
 
@@ -56,12 +72,20 @@ std::vector<std::string> LogLevelNames() {
   return {"trace", "debug", "info", "warn", "warning", "error", "off"};
 }
 
-void StartLog(const std::string& program, const std::string& level) {
+std::vector<std::string> LogFormatNames() { return {"text", "json"}; }
+
+void StartLog(const std::string& program, const std::string& level, const std::string& format) {
+  g_log.program = program;
+  g_log.json = format == "json";
   spdlog::set_default_logger(spdlog::stderr_color_mt(program));
   spdlog::set_level(spdlog::level::from_str(level));
+  if (g_log.json) spdlog::set_pattern("%v");
 }
 
-void WriteLog(LogLevel level, const std::string& line) {
+void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject) {
+  const std::string line =
+      g_log.json ? LogJson(g_log.program, level, subject, text, std::chrono::system_clock::now())
+                 : LogText(subject, text);
   switch (level) {
     case LogLevel::kInfo:
       spdlog::info("{}", line);
@@ -75,14 +99,36 @@ void WriteLog(LogLevel level, const std::string& line) {
   }
 }
 
-std::string LogText(const JobId& job, std::optional<uint32_t> tile, uint32_t attempt,
-                    const WorkerId& worker, std::string_view text) {
+std::string LogText(const LogSubject& subject, std::string_view text) {
   std::string line;
-  if (!job.empty()) line += "job=" + job.value + " ";
-  if (tile) line += "tile=" + std::to_string(*tile) + " ";
-  if (attempt != 0) line += "attempt=" + std::to_string(attempt) + " ";
-  if (!worker.empty()) line += "worker=" + worker.value + " ";
+  if (!subject.job.empty()) line += "job=" + subject.job.value + " ";
+  if (subject.tile) line += "tile=" + std::to_string(*subject.tile) + " ";
+  if (subject.attempt != 0) line += "attempt=" + std::to_string(subject.attempt) + " ";
+  if (!subject.worker.empty()) line += "worker=" + subject.worker.value + " ";
   return line.append(text);
+}
+
+std::string LogJson(std::string_view program, LogLevel level, const LogSubject& subject,
+                    std::string_view text, std::chrono::system_clock::time_point time) {
+  const auto ms =
+      std::chrono::duration_cast<std::chrono::milliseconds>(time.time_since_epoch()).count();
+  const std::time_t seconds = static_cast<std::time_t>(ms / 1000);
+  std::tm utc{};
+  ::gmtime_r(&seconds, &utc);
+  char when[40];
+  const size_t size = std::strftime(when, sizeof(when), "%Y-%m-%dT%H:%M:%S", &utc);
+  std::snprintf(when + size, sizeof(when) - size, ".%03dZ", static_cast<int>(ms % 1000));
+  nlohmann::ordered_json line;
+  line["time"] = when;
+  line["level"] = NameOf(level);
+  line["program"] = program;
+  if (!subject.job.empty()) line["job"] = subject.job.value;
+  if (subject.tile) line["tile"] = *subject.tile;
+  if (subject.attempt != 0) line["attempt"] = subject.attempt;
+  if (!subject.worker.empty()) line["worker"] = subject.worker.value;
+  line["text"] = text;
+  // What is no UTF-8 came from outside; a line is written all the same.
+  return line.dump(-1, ' ', false, nlohmann::ordered_json::error_handler_t::replace);
 }
 
 StopSignals::StopSignals() {

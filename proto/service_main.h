@@ -30,12 +30,26 @@ absl::Status CheckHostPort(std::string_view flag, const std::string& address, bo
 
 // What --log-level takes.
 std::vector<std::string> LogLevelNames();
-// Lines go to stderr from here on.
-void StartLog(const std::string& program, const std::string& level);
-void WriteLog(LogLevel level, const std::string& line);
-// "job=… tile=… attempt=… worker=… text"; what is empty or 0 is left out.
-std::string LogText(const JobId& job, std::optional<uint32_t> tile, uint32_t attempt,
-                    const WorkerId& worker, std::string_view text);
+// What --log-format takes: "text", "json".
+std::vector<std::string> LogFormatNames();
+// What a line is about; what is empty or 0 is left out.
+struct LogSubject {
+  JobId job;
+  std::optional<uint32_t> tile;
+  uint32_t attempt = 0;
+  WorkerId worker;
+};
+// Lines go to stderr from here on. In the format "json" each is an object with time (UTC,
+// RFC 3339), level ("info", "warning", "error"), program, text, and job, tile, attempt and worker
+// as far as they are known; ReportFatal writes one, too.
+void StartLog(const std::string& program, const std::string& level,
+              const std::string& format = "text");
+void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject = {});
+// The lines, without the time and level that the text format has in front.
+// "job=… tile=… attempt=… worker=… text".
+std::string LogText(const LogSubject& subject, std::string_view text);
+std::string LogJson(std::string_view program, LogLevel level, const LogSubject& subject,
+                    std::string_view text, std::chrono::system_clock::time_point time);
 
 // SIGTERM and SIGINT, heard only by whoever waits. Construct before any thread starts, so that all
 // inherit it. SIGPIPE and SIGXFSZ are ignored, too.

@@ -214,10 +214,22 @@ absl::Status AccessGuard::Admit(std::string_view method, const Credentials& cred
   return status;
 }
 
+AccessGuard::Refusals AccessGuard::refusals() {
+  std::lock_guard lock(mutex_);
+  return refusals_;
+}
+
 void AccessGuard::Tell(std::string_view method, const absl::Status& status) {
-  if (!options_.refused) return;
   {
     std::lock_guard lock(mutex_);
+    if (absl::IsPermissionDenied(status)) {
+      ++refusals_.permission_denied;
+    } else if (absl::IsResourceExhausted(status)) {
+      ++refusals_.too_many_calls;
+    } else {
+      ++refusals_.unauthenticated;
+    }
+    if (!options_.refused) return;
     const auto now = clock_->Now();
     if (now - telling_since_ >= kTellPeriod) {
       telling_since_ = now;

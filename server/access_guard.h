@@ -50,6 +50,12 @@ class AccessGuard {
   // Who an admitted call is from.
   absl::StatusOr<Caller> Identify(const Credentials& credentials);
 
+  // Calls that were not admitted, since the start, by cause.
+  struct Refusals {
+    uint64_t unauthenticated = 0, permission_denied = 0, too_many_calls = 0;
+  };
+  Refusals refusals();
+
  private:
   struct Known {
     Caller caller;
@@ -88,6 +94,7 @@ class AccessGuard {
   std::map<std::string, Bucket, std::less<>> buckets_;     // by name
   std::chrono::steady_clock::time_point telling_since_;
   int told_ = 0;
+  Refusals refusals_;
 };
 
 }  // namespace farpoint

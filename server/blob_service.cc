@@ -84,6 +84,7 @@ class BlobServiceImpl final : public v1::BlobService::Service {
         }
         FP_RETURN_IF_ERROR(
             writer->Append(std::as_bytes(std::span(chunk.data().data(), chunk.data().size()))));
+        if (access_.traffic != nullptr) access_.traffic->blobs_received += chunk.data().size();
       } while (stream->Read(&chunk));
       FP_RETURN_IF_ERROR(writer->Commit());
       if (access_.ledger == nullptr) return absl::OkStatus();
@@ -116,6 +117,7 @@ class BlobServiceImpl final : public v1::BlobService::Service {
         at += size;
         // Blocks while the peer does not read: at most a few chunks are in memory.
         if (!stream->Write(chunk)) return absl::CancelledError("the peer is gone");
+        if (access_.traffic != nullptr) access_.traffic->blobs_sent += size;
         chunk.clear_size_bytes();
       } while (at < bytes.size());
       return absl::OkStatus();

@@ -383,6 +383,70 @@ class CoordinatorImpl final : public Coordinator {
     return info;
   }
 
+  absl::StatusOr<JobView> View(const JobId& id, uint32_t frame_index) override {
+    JobView view{.frame_index = frame_index};
+    JobReport report;
+    {
+      std::lock_guard lock(mutex_);
+      FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
+      const JobSpec& spec = job->stored.spec;
+      if (frame_index >= spec.frame_count()) {
+        return absl::InvalidArgumentError(
+            "frame index " + std::to_string(frame_index) + " is not among the " +
+            std::to_string(spec.frame_count()) + " of job " + id.value);
+      }
+      view.status = StatusOf(*job);
+      view.film = spec.film;
+      view.frame_number = spec.frame_number(frame_index);
+      view.first_tile = frame_index * static_cast<uint32_t>(job->tiles.size());
+      view.tiles.resize(job->tiles.size());
+      for (size_t i = 0; i < view.tiles.size(); ++i) view.tiles[i].rect = job->tiles[i];
+      report = scheduler_.Report(id);
+    }
+    const auto tile_of = [&view](uint32_t tile) -> TileView* {
+      const uint32_t index = tile - view.first_tile;  // beyond all where tile is before the first
+      return index < view.tiles.size() ? &view.tiles[index] : nullptr;
+    };
+    for (const TroubledTile& troubled : report.troubled) {
+      if (TileView* const tile = tile_of(troubled.tile)) {
+        tile->failures = troubled.failures;
+        if (troubled.set_aside) tile->state = TileView::State::kFailed;
+      }
+    }
+    for (const TileInWork& work : report.in_work) {
+      if (TileView* const tile = tile_of(work.grant.tile)) {
+        tile->state = TileView::State::kLeased;
+        tile->worker = work.worker_name;
+        tile->fraction = std::max(tile->fraction, work.fraction);
+      }
+    }
+    FP_ASSIGN_OR_RETURN(
+        const std::vector<StoredTileStats> committed,
+        store_->TileStatsOf(id, view.first_tile, static_cast<uint32_t>(view.tiles.size())));
+    for (const StoredTileStats& stored : committed) {
+      TileView* const tile = tile_of(stored.tile);
+      if (tile == nullptr) continue;
+      const auto count = [&](const char* name) {
+        const auto at = stored.stats.counts.find(name);
+        return at == stored.stats.counts.end() ? uint64_t{0} : at->second;
+      };
+      tile->state = TileView::State::kCommitted;
+      tile->worker = stored.worker;
+      for (const double seconds : stored.stats.seconds) tile->seconds += seconds;
+      tile->receivers = count("receivers");
+      tile->clusters = count("clusters");
+      tile->cut_nodes = count("cut_nodes");
+    }
+    FP_ASSIGN_OR_RETURN(const std::vector<StoredEvent> lines,
+                        store_->LastLogLines(id, LogLevel::kInfo, kMaxViewedLogLines));
+    for (const StoredEvent& event : lines) {
+      if (const auto* line = std::get_if<LogLine>(&event.body)) {
+        view.log.push_back({.line = *line, .unix_ms = event.unix_ms});
+      }
+    }
+    return view;
+  }
+
   absl::StatusOr<TileData> FetchTile(const JobId& id, uint32_t tile) override {
     {
       std::lock_guard lock(mutex_);
@@ -499,7 +563,8 @@ class CoordinatorImpl final : public Coordinator {
       HandleNews(scheduler_.RefuseResult(result.lease, std::string(wrong.message())));
       lock.unlock();
       NotifyAll();
-      return ReturnAnswer{.accepted = false, .reason = std::string(wrong.message())};
+      return ReturnAnswer{
+          .accepted = false, .reason = std::string(wrong.message()), .damaged = true};
     }
     if (grant.audit) return ReturnAudit(grant, result);
     absl::Status stored =

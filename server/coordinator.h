@@ -51,6 +51,32 @@ namespace farpoint {
 
 class SceneBaker;  // server/scene_baker.h
 
+// One frame of a job, for people who watch.
+struct TileView {
+  enum class State : uint8_t { kQueued, kLeased, kCommitted, kFailed };
+  PixelRect rect;
+  State state = State::kQueued;
+  // Of a committed tile, of all attempts the one that counted:
+  double seconds = 0;                                   // thread-seconds of all stages
+  uint64_t receivers = 0, clusters = 0, cut_nodes = 0;  // 0: none, or not counted
+  std::string worker;     // who rendered it, or is at it; may be empty
+  float fraction = 0;     // [0, 1] of a leased one
+  uint32_t failures = 0;  // of one that is not committed
+};
+struct JobLogEntry {
+  LogLine line;
+  int64_t unix_ms = 0;  // 0: not known
+};
+struct JobView {
+  JobStatus status;
+  FilmSpec film;
+  uint32_t frame_index = 0, first_tile = 0;  // of tiles, in the job
+  int32_t frame_number = 0;
+  std::vector<TileView> tiles;
+  std::vector<JobLogEntry> log;  // the last kMaxViewedLogLines
+};
+inline constexpr uint32_t kMaxViewedLogLines = 100;
+
 class CoordinatorApi {
  public:
   virtual ~CoordinatorApi() = default;
@@ -97,6 +123,9 @@ class CoordinatorApi {
                                                            uint64_t after_sequence,
                                                            std::chrono::milliseconds wait) = 0;
   virtual absl::StatusOr<JobInfo> FetchInfo(const JobId& job) = 0;
+  // kInvalidArgument beyond the job's frames. Reads as many rows of the store as the frame has
+  // tiles.
+  virtual absl::StatusOr<JobView> View(const JobId& job, uint32_t frame_index) = 0;
   // kFailedPrecondition if the tile is not committed.
   virtual absl::StatusOr<TileData> FetchTile(const JobId& job, uint32_t tile) = 0;
 

@@ -110,6 +110,26 @@ class GrpcServerImpl final : public GrpcServer {
   }
 
   int port() const override { return gate_->port(); }
+
+  absl::StatusOr<Caller> Admit(std::string_view method, std::string_view authorization) override {
+    if (guard_ == nullptr) return Caller{Role::kAdmin, ""};
+    const AccessGuard::Credentials shown{.certificates = "", .authorization = authorization};
+    FP_RETURN_IF_ERROR(guard_->Admit(method, shown));
+    return guard_->Identify(shown);
+  }
+  absl::Status MayChange(const Caller& caller, const JobId& job) override {
+    return farpoint::MayChange(caller, access_, coordinator_, job);
+  }
+  std::string OwnerOf(const JobId& job) override {
+    return ledger_ == nullptr ? "" : ledger_->OwnerOf(job);
+  }
+  uint64_t connections() const override { return gate_->connections(); }
+  AccessGuard::Refusals refusals() override {
+    return guard_ == nullptr ? AccessGuard::Refusals{} : guard_->refusals();
+  }
+  const Traffic& traffic() const override { return traffic_; }
+  bool draining() const override { return draining_; }
+
   void StopServing() override {
     draining_ = true;
     server_->GetHealthCheckService()->SetServingStatus(false);
@@ -137,6 +157,7 @@ class GrpcServerImpl final : public GrpcServer {
     }
     access_.guard = guard_.get();
     access_.ledger = ledger_.get();
+    access_.traffic = &traffic_;
     access_.facts = [this] {
       ServerFacts facts;
       if (options_.facts) facts = options_.facts();
@@ -163,6 +184,7 @@ class GrpcServerImpl final : public GrpcServer {
   std::atomic<bool> draining_ = false;
   std::unique_ptr<AccessGuard> guard_;
   std::unique_ptr<ClientLedger> ledger_;
+  Traffic traffic_;
   ServiceAccess access_;
   std::unique_ptr<ConnectionGate> gate_;
   std::unique_ptr<grpc::Service> blobs_, jobs_, workers_;

@@ -7,6 +7,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <string_view>
 
 #include "core/base/status.h"
 #include "proto/tls_files.h"
@@ -45,6 +46,19 @@ class GrpcServer {
   virtual ~GrpcServer() = default;  // Shutdown(0)
 
   virtual int port() const = 0;
+
+  // For other ways in beside gRPC, by the same rules: who calls, by the header `authorization`, if
+  // it may call `method` ("/farpoint.v1.JobService/Status"); without TLS an admin. Errors as
+  // AccessGuard::Admit.
+  virtual absl::StatusOr<Caller> Admit(std::string_view method, std::string_view authorization) = 0;
+  // Whether the caller may change the job; kNotFound, kPermissionDenied.
+  virtual absl::Status MayChange(const Caller& caller, const JobId& job) = 0;
+  virtual std::string OwnerOf(const JobId& job) = 0;  // empty: not known
+  virtual uint64_t connections() const = 0;
+  virtual AccessGuard::Refusals refusals() = 0;
+  virtual const Traffic& traffic() const = 0;
+  virtual bool draining() const = 0;
+
   // Health says NOT_SERVING from now on; calls still go through.
   virtual void StopServing() = 0;
   // Takes no more calls; those in progress have `grace` to end.

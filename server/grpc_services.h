@@ -24,7 +24,11 @@ struct ServiceAccess {
   AccessGuard* guard = nullptr;  // null: callers cannot be told apart, everybody may do everything
   ClientLedger* ledger = nullptr;      // null: nothing is limited for each client
   std::function<ServerFacts()> facts;  // none: nothing is known
+  Traffic* traffic = nullptr;          // null: not counted
 };
+// OK if the caller may change the job: it is an admin's or its own. kNotFound, kPermissionDenied.
+absl::Status MayChange(const Caller& caller, const ServiceAccess& access,
+                       CoordinatorApi& coordinator, const JobId& job);
 // Of a call that the guard admitted. kUnauthenticated if its certificate has expired meanwhile.
 absl::StatusOr<Caller> CallerOf(const grpc::ServerContextBase& context,
                                 const ServiceAccess& access);

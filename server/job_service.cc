@@ -172,16 +172,9 @@ class JobServiceImpl final : public v1::JobService::Service {
   }
 
  private:
-  // Its owner's, or an admin's to change.
   absl::Status MayChange(const grpc::ServerContext& context, const JobId& job) {
     FP_ASSIGN_OR_RETURN(const Caller caller, CallerOf(context, access_));
-    if (caller.role == Role::kAdmin || access_.ledger == nullptr) return absl::OkStatus();
-    FP_RETURN_IF_ERROR(coordinator_.Status(job).status());  // kNotFound before whose it is
-    const std::string owner = access_.ledger->OwnerOf(job);
-    if (owner == caller.name) return absl::OkStatus();
-    return absl::PermissionDeniedError(
-        "job " + job.value + " is " + (owner.empty() ? "nobody's" : "'" + owner + "''s") +
-        ", not '" + caller.name + "''s; ask an admin (farpoint certs add NAME --role admin)");
+    return farpoint::MayChange(caller, access_, coordinator_, job);
   }
 
   v1::JobStatus Described(const JobStatus& status) {
@@ -212,7 +205,7 @@ class JobServiceImpl final : public v1::JobService::Service {
     return health;
   }
 
-  static absl::Status SendTile(const TileData& data, grpc::ServerWriter<v1::TileChunk>& stream) {
+  absl::Status SendTile(const TileData& data, grpc::ServerWriter<v1::TileChunk>& stream) {
     const std::span<const std::byte> bytes = data.bytes.bytes();
     v1::TileChunk chunk;
     chunk.set_tile(data.tile);
@@ -225,6 +218,7 @@ class JobServiceImpl final : public v1::JobService::Service {
       chunk.set_data(bytes.data() + at, size);
       at += size;
       if (!stream.Write(chunk)) return absl::CancelledError("the peer is gone");
+      if (access_.traffic != nullptr) access_.traffic->tiles_sent += size;
     } while (at < bytes.size());
     return absl::OkStatus();
   }
@@ -234,6 +228,17 @@ class JobServiceImpl final : public v1::JobService::Service {
 };
 
 }  // namespace
+
+absl::Status MayChange(const Caller& caller, const ServiceAccess& access,
+                       CoordinatorApi& coordinator, const JobId& job) {
+  if (caller.role == Role::kAdmin || access.ledger == nullptr) return absl::OkStatus();
+  FP_RETURN_IF_ERROR(coordinator.Status(job).status());  // kNotFound before whose it is
+  const std::string owner = access.ledger->OwnerOf(job);
+  if (owner == caller.name) return absl::OkStatus();
+  return absl::PermissionDeniedError(
+      "job " + job.value + " is " + (owner.empty() ? "nobody's" : "'" + owner + "''s") + ", not '" +
+      caller.name + "''s; ask an admin (farpoint certs add NAME --role admin)");
+}
 
 std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator,
                                               const ServiceAccess& access) {

@@ -486,6 +486,25 @@ class SqliteJobStore final : public JobStore {
         job);
   }
 
+  absl::StatusOr<std::vector<StoredTileStats>> TileStatsOf(const JobId& job, uint32_t first,
+                                                           uint32_t count) override {
+    std::lock_guard lock(mutex_);
+    std::vector<StoredTileStats> tiles;
+    Statement query(db_, path_,
+                    "SELECT tile, worker, stats FROM tiles WHERE job = "
+                    "(SELECT number FROM jobs WHERE id = ?) AND tile >= ? AND tile < ? "
+                    "ORDER BY tile");
+    query.Text(job.value).Int(first).Int(int64_t{first} + count);
+    for (;;) {
+      FP_ASSIGN_OR_RETURN(const bool row, query.Step());
+      if (!row) return tiles;
+      StoredTileStats& tile = tiles.emplace_back();
+      tile.tile = static_cast<uint32_t>(query.GetInt(0));
+      tile.worker = query.GetBytes(1);
+      FP_ASSIGN_OR_RETURN(tile.stats, ReadStats(query.GetBytes(2)));
+    }
+  }
+
   absl::StatusOr<std::vector<TileSeconds>> SlowestTiles(const JobId& job, size_t count) override {
     std::lock_guard lock(mutex_);
     std::vector<TileSeconds> slowest;

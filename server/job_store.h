@@ -77,6 +77,12 @@ struct TileSeconds {
   double seconds = 0;
 };
 
+struct StoredTileStats {
+  uint32_t tile = 0;
+  std::string worker;  // name of who rendered it; may be empty
+  Stats stats;
+};
+
 struct StoredEvent {
   uint64_t sequence = 0;
   JobEventBody body;
@@ -127,6 +133,9 @@ class JobStore {
   virtual absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) = 0;  // ascending
   // Added in tile order.
   virtual absl::StatusOr<Stats> TileStats(const JobId& job) = 0;
+  // Of the committed tiles of [first, first + count), ascending.
+  virtual absl::StatusOr<std::vector<StoredTileStats>> TileStatsOf(const JobId& job, uint32_t first,
+                                                                   uint32_t count) = 0;
   // kNotFound if it is not committed; kDataLoss if its bytes are damaged.
   virtual absl::StatusOr<TileData> ReadTile(const JobId& job, uint32_t tile) = 0;
   // Drops the tiles of an unfinished job whose bytes are missing or damaged; returns which. Reads

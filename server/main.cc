@@ -5,15 +5,22 @@
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
+#include <memory>
+#include <optional>
 #include <string>
+#include <utility>
+#include <vector>
 
 #include "core/base/blob.h"
 #include "core/base/machine.h"
+#include "proto/access.h"
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 #include "server/coordinator.h"
+#include "server/coordinator_meter.h"
 #include "server/grpc_server.h"
 #include "server/scene_baker.h"
+#include "server/web_server.h"
 
 namespace farpoint {
 namespace {
@@ -22,12 +29,12 @@ constexpr const char* kProgram = "farpoint-server";
 
 struct ServerFlags {
   std::string listen = "127.0.0.1:7447";
-  std::string store, port_file, log_level = "info";
+  std::string store, port_file, log_level = "info", log_format = "text";
   unsigned threads = 0;
   uint64_t silence_ms = 4000, lease_ms = 120000, heartbeat_ms = 1000, speculate_after_ms = 1000;
   uint64_t reconnect_ms = 500, stall_ms = 3000;
   double audit_fraction = 0.02;
-  std::string blob_dir;
+  std::string blob_dir, web, metrics;
   uint64_t retention_hours = 24 * 7, drain_seconds = 30;
   uint64_t max_blob_bytes = uint64_t{1} << 36;
   uint64_t bake_cache_mib = kDefaultBakeCacheBytes >> 20;
@@ -79,7 +86,14 @@ void DefineFlags(CLI::App& app, ServerFlags& flags) {
       ->capture_default_str();
   app.add_option("--store", flags.store, "Folder for jobs, blobs and tiles")->required();
   app.add_option("--threads", flags.threads, "Threads that bake scenes; 0: all cores");
+  app.add_option(
+      "--web", flags.web,
+      "HOST:PORT of a web page that shows jobs, workers and images; it has /metrics, too");
+  app.add_option("--metrics", flags.metrics, "HOST:PORT of /metrics alone, for Prometheus");
   app.add_option("--port-file", flags.port_file, "Write the chosen port to this file");
+  app.add_option("--log-format", flags.log_format, "How the log is written: for people or programs")
+      ->check(CLI::IsMember(LogFormatNames()))
+      ->capture_default_str();
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
       ->check(CLI::IsMember(LogLevelNames()))
       ->capture_default_str();
@@ -174,8 +188,40 @@ absl::StatusOr<GrpcServerOptions> ServerOptionsOf(const ServerFlags& flags) {
   return options;
 }
 
+// The page and the metrics, on the addresses that the flags name.
+absl::StatusOr<std::vector<std::unique_ptr<HttpServer>>> StartWeb(
+    const ServerFlags& flags, const std::optional<TlsMaterial>& tls, CoordinatorMeter& meter,
+    GrpcServer& api) {
+  std::vector<std::unique_ptr<HttpServer>> servers;
+  const auto start = [&](const char* name, const std::string& address, bool page) -> absl::Status {
+    if (address.empty()) return absl::OkStatus();
+    WebServerOptions options{.address = address, .tls = tls, .page = page};
+    if (!page && IsLoopback(address)) {
+      options.tls.reset();
+      options.open_metrics = true;
+    }
+    const bool secure = options.tls.has_value();
+    absl::StatusOr<std::unique_ptr<HttpServer>> server =
+        StartWebServer(std::move(options), meter, api);
+    if (!server.ok()) return Annotate(server.status(), std::string("--") + name);
+    const std::string text = std::string(name) + " on " + (secure ? "https://" : "http://") +
+                             address.substr(0, address.rfind(':')) + ":" +
+                             std::to_string((*server)->port()) + (page ? "/" : "/metrics");
+    std::printf("%s\n", text.c_str());
+    std::fflush(stdout);
+    WriteLog(LogLevel::kInfo, text);
+    servers.push_back(*std::move(server));
+    return absl::OkStatus();
+  };
+  FP_RETURN_IF_ERROR(start("web", flags.web, true));
+  FP_RETURN_IF_ERROR(start("metrics", flags.metrics, false));
+  return servers;
+}
+
 void LogEntry(const CoordinatorLogEntry& entry) {
-  WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, entry.worker, entry.text));
+  WriteLog(
+      entry.level, entry.text,
+      {.job = entry.job, .tile = entry.tile, .attempt = entry.attempt, .worker = entry.worker});
 }
 
 int Main(int argc, char** argv) {
@@ -193,7 +239,18 @@ int Main(int argc, char** argv) {
     ReportFatal(kProgram, bad);
     return kServiceExitUsage;
   }
-  StartLog(kProgram, flags.log_level);
+  for (const auto& [name, address] :
+       {std::pair{"--web", flags.web}, std::pair{"--metrics", flags.metrics}}) {
+    absl::Status bad;
+    if (!address.empty()) bad = CheckHostPort(name, address, /*any_port=*/true);
+    if (bad.ok() && !address.empty() && flags.tls.empty()) {
+      bad = Annotate(CheckMayBePlain(flags.tls, address), name);
+    }
+    if (bad.ok()) continue;
+    ReportFatal(kProgram, bad);
+    return kServiceExitUsage;
+  }
+  StartLog(kProgram, flags.log_level, flags.log_format);
   const StopSignals signals;
   absl::StatusOr<GrpcServerOptions> server_options = ServerOptionsOf(flags);
   if (!server_options.ok()) {
@@ -211,7 +268,9 @@ int Main(int argc, char** argv) {
 
   CoordinatorOptions options;
   options.store_directory = flags.store;
-  options.baker = MakeCoreBaker(flags.threads, flags.bake_cache_mib << 20);
+  const auto stages = std::make_shared<StageMeter>();
+  options.baker =
+      MakeMeteredBaker(MakeCoreBaker(flags.threads, flags.bake_cache_mib << 20), stages);
   options.limits = flags.limits;
   options.max_blob_bytes = flags.max_blob_bytes;
   options.heartbeat = std::chrono::milliseconds(flags.heartbeat_ms);
@@ -237,11 +296,16 @@ int Main(int argc, char** argv) {
   if (!coordinator.ok()) {
     return ReportFatal(kProgram, coordinator.status());
   }
+  const std::optional<TlsMaterial> tls_material = server_options->tls;
+  CoordinatorMeter meter(**coordinator, stages);
   absl::StatusOr<std::unique_ptr<GrpcServer>> server =
-      GrpcServer::Start(**coordinator, flags.listen, *std::move(server_options));
+      GrpcServer::Start(meter, flags.listen, *std::move(server_options));
   if (!server.ok()) {
     return ReportFatal(kProgram, server.status());
   }
+  absl::StatusOr<std::vector<std::unique_ptr<HttpServer>>> web =
+      StartWeb(flags, tls_material, meter, **server);
+  if (!web.ok()) return ReportFatal(kProgram, web.status());
   const std::string port = std::to_string((*server)->port());
   if (!flags.port_file.empty()) {
     const absl::Status written =
@@ -264,6 +328,7 @@ int Main(int argc, char** argv) {
   while ((*coordinator)->ActiveLeases() > 0 && std::chrono::steady_clock::now() < end) {
     if (signals.Wait(std::chrono::milliseconds(50))) break;
   }
+  web->clear();
   (*server)->Shutdown(std::chrono::milliseconds(500));
   server->reset();
   coordinator->reset();

@@ -1,6 +1,7 @@
 // How a coordinator's process and its folders are, for `farpoint doctor`. Thread-safe.
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <string>
 
@@ -22,6 +23,12 @@ struct ServerFacts {
   // A shared folder of blobs, and the name of a file that was put there just now.
   std::string blob_directory, blob_mark;
   int64_t certificate_not_after_s = 0;  // 0: no TLS
+};
+
+// Bytes of scenes and tiles that went over the network, headers left out. Thread-safe.
+struct Traffic {
+  std::atomic<uint64_t> blobs_sent{0}, blobs_received{0};  // to workers; from clients
+  std::atomic<uint64_t> tiles_sent{0};                     // to clients
 };
 
 // Fills store_error and disk by looking at `store` (empty: in memory), memory and files.

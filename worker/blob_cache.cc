@@ -104,6 +104,7 @@ absl::StatusOr<Blob> BlobCache::FromFolder(const Digest& digest) {
 
 absl::StatusOr<Blob> BlobCache::Get(const Digest& digest, const std::function<bool()>& progress) {
   absl::StatusOr<Blob> blob = FromFolder(digest);
+  if (blob.ok()) ++in_cache_;
   if (blob.ok() || !absl::IsNotFound(blob.status())) return blob;
   FP_RETURN_IF_ERROR(FetchFromAnywhere(digest, progress));
   blob = FromFolder(digest);
@@ -117,6 +118,7 @@ absl::Status BlobCache::FetchFromAnywhere(const Digest& digest,
     FolderStreamer folder(options_.shared_directory);
     uint64_t received = 0;
     const absl::Status fetched = Fetch(digest, progress, folder, received);
+    if (fetched.ok()) ++in_shared_folder_;
     if (fetched.ok() || absl::IsCancelled(fetched) || absl::IsResourceExhausted(fetched)) {
       return fetched;
     }
@@ -127,6 +129,7 @@ absl::Status BlobCache::FetchFromAnywhere(const Digest& digest,
   absl::Status fetched = FetchPatiently(digest, progress);
   // A part that an earlier process left may be damaged: once more, from the start.
   if (absl::IsDataLoss(fetched)) fetched = FetchPatiently(digest, progress);
+  if (fetched.ok()) ++at_coordinator_;
   return fetched;
 }
 

@@ -3,6 +3,7 @@
 // it stopped, in the next process too. Several workers may share the folder. Thread-safe.
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <functional>
 #include <memory>
@@ -41,6 +42,12 @@ class BlobCache final : public BlobSource {
   // kDataLoss if what arrives has the wrong hash twice, kUnavailable if the disk is full.
   absl::StatusOr<Blob> Get(const Digest& digest, const std::function<bool()>& progress) override;
 
+  // Where the blobs that Get returned were, since the start.
+  struct Finds {
+    uint64_t cache = 0, shared_folder = 0, coordinator = 0;
+  };
+  Finds finds() const { return {in_cache_, in_shared_folder_, at_coordinator_}; }
+
  private:
   BlobCache(BlobCacheOptions options, BlobStreamer& streamer)
       : options_(std::move(options)), streamer_(streamer) {}
@@ -55,6 +62,7 @@ class BlobCache final : public BlobSource {
 
   const BlobCacheOptions options_;
   BlobStreamer& streamer_;
+  std::atomic<uint64_t> in_cache_{0}, in_shared_folder_{0}, at_coordinator_{0};
   std::mutex mutex_;
   std::set<Digest> verified_;  // guarded by mutex_
 };

@@ -10,6 +10,10 @@
 #include <thread>
 
 #include "core/base/executor.h"
+#include "proto/access.h"
+#include "proto/certificate.h"
+#include "proto/http_server.h"
+#include "proto/metrics_text.h"
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 #include "worker/blob_cache.h"
@@ -18,6 +22,7 @@
 #include "worker/grpc_link.h"
 #include "worker/tile_renderer.h"
 #include "worker/worker.h"
+#include "worker/worker_meter.h"
 
 namespace farpoint {
 namespace {
@@ -25,7 +30,7 @@ namespace {
 constexpr const char* kProgram = "farpoint-worker";
 
 struct WorkerFlags {
-  std::string coordinator, cache, blob_dir, name, log_level = "info";
+  std::string coordinator, cache, blob_dir, name, metrics, log_level = "info", log_format = "text";
   unsigned threads = 0;
   uint64_t cache_bytes = uint64_t{64} << 30;
   uint64_t cached_scenes = 2;
@@ -79,13 +84,18 @@ void DefineFlags(CLI::App& app, WorkerFlags& flags) {
                  "How long a stop lets the tile in work go on before it is given back")
       ->check(CLI::Range(0, 86400))
       ->capture_default_str();
+  app.add_option("--metrics", flags.metrics, "HOST:PORT of /metrics, for Prometheus");
+  app.add_option("--log-format", flags.log_format, "How the log is written: for people or programs")
+      ->check(CLI::IsMember(LogFormatNames()))
+      ->capture_default_str();
   app.add_option("--log-level", flags.log_level, "What is logged to stderr")
       ->check(CLI::IsMember(LogLevelNames()))
       ->capture_default_str();
 }
 
 void LogEntry(const WorkerLogEntry& entry) {
-  WriteLog(entry.level, LogText(entry.job, entry.tile, entry.attempt, {}, entry.text));
+  WriteLog(entry.level, entry.text,
+           {.job = entry.job, .tile = entry.tile, .attempt = entry.attempt});
 }
 
 // How to reach the coordinator. kInvalidArgument: the flags contradict each other.
@@ -102,6 +112,48 @@ absl::StatusOr<ChannelSecurity> SecurityOf(const WorkerFlags& flags) {
         "--tls-cert: not given; a worker needs a certificate, tokens are for clients");
   }
   return security;
+}
+
+// On loopback open to everybody who is there; else, with TLS, to whoever shows a certificate of the
+// farm. Null if it is not wanted.
+absl::StatusOr<std::unique_ptr<HttpServer>> StartMetrics(const WorkerFlags& flags,
+                                                         const ChannelSecurity& security,
+                                                         const WorkerMeter& meter,
+                                                         const BlobCache& cache) {
+  if (flags.metrics.empty()) return nullptr;
+  HttpServerOptions options;
+  options.address = flags.metrics;
+  options.threads = 4;
+  if (!IsLoopback(flags.metrics)) options.tls = security.tls;
+  options.ask_for_certificate = options.tls.has_value();
+  const bool secure = options.tls.has_value();
+  const unsigned threads =
+      flags.threads != 0 ? flags.threads : std::max(1u, std::thread::hardware_concurrency());
+  FP_ASSIGN_OR_RETURN(
+      std::unique_ptr<HttpServer> server,
+      HttpServer::Start(
+          options, [&meter, &cache, threads,
+                    ca = secure ? security.tls->ca : std::string()](const HttpRequest& request) {
+            if (!ca.empty()) {
+              const absl::Status known =
+                  request.certificates.empty()
+                      ? absl::UnauthenticatedError("show a certificate of this farm")
+                      : CheckIssued(request.certificates, ca, /*server=*/false, NowUnixS());
+              if (!known.ok()) {
+                return HttpResponse{.status = HttpStatusOf(known),
+                                    .body = std::string(known.message()) + "\n"};
+              }
+            }
+            if (request.path != "/metrics") {
+              return HttpResponse{.status = 404, .body = "only /metrics is here\n"};
+            }
+            return HttpResponse{.content_type = kMetricsContentType,
+                                .body = meter.Metrics(cache.finds(), threads)};
+          }));
+  WriteLog(LogLevel::kInfo, std::string("metrics on ") + (secure ? "https://" : "http://") +
+                                flags.metrics.substr(0, flags.metrics.rfind(':')) + ":" +
+                                std::to_string(server->port()) + "/metrics");
+  return server;
 }
 
 int Main(int argc, char** argv) {
@@ -125,7 +177,7 @@ int Main(int argc, char** argv) {
     ReportFatal(kProgram, bad);
     return kServiceExitUsage;
   }
-  StartLog(kProgram, flags.log_level);
+  StartLog(kProgram, flags.log_level, flags.log_format);
   const StopSignals signals;
   const absl::StatusOr<ChannelSecurity> security = SecurityOf(flags);
   if (!security.ok()) {
@@ -135,6 +187,17 @@ int Main(int argc, char** argv) {
   if (!security->tls && !IsLoopback(flags.coordinator)) {
     WriteLog(LogLevel::kWarning, "--insecure: whoever is on the way to " + flags.coordinator +
                                      " can read scenes and change pixels");
+  }
+
+  if (!flags.metrics.empty()) {
+    absl::Status bad = CheckHostPort("--metrics", flags.metrics, /*any_port=*/true);
+    if (bad.ok() && flags.tls.empty()) {
+      bad = Annotate(CheckMayBePlain(flags.tls, flags.metrics), "--metrics");
+    }
+    if (!bad.ok()) {
+      ReportFatal(kProgram, bad);
+      return kServiceExitUsage;
+    }
   }
 
   WorkerOptions options;
@@ -153,15 +216,19 @@ int Main(int argc, char** argv) {
   options.log = LogEntry;
 
   const std::unique_ptr<GrpcLink> link = GrpcLink::Connect(flags.coordinator, *security);
+  WorkerMeter meter(*link, *link);
   const absl::StatusOr<std::unique_ptr<BlobCache>> cache =
       BlobCache::Open({.directory = flags.cache,
                        .max_bytes = flags.cache_bytes,
                        .warn = [](const std::string& text) { WriteLog(LogLevel::kWarning, text); },
                        .shared_directory = flags.blob_dir},
-                      *link);
+                      meter);
   if (!cache.ok()) return ReportFatal(kProgram, Annotate(cache.status(), "--cache"));
   const std::unique_ptr<TileRenderer> renderer = MakeCoreRenderer();
-  Worker worker(std::move(options), *link, **cache, *renderer);
+  const absl::StatusOr<std::unique_ptr<HttpServer>> metrics =
+      StartMetrics(flags, *security, meter, **cache);
+  if (!metrics.ok()) return ReportFatal(kProgram, Annotate(metrics.status(), "--metrics"));
+  Worker worker(std::move(options), meter, **cache, *renderer);
   WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " for " +
                                 flags.coordinator + ", cache '" + flags.cache + "'");
 

@@ -38,8 +38,20 @@ TEST(ServiceMain, ExitCodesTellWhetherToTryAgain) {
 }
 
 TEST(ServiceMain, LogLinesNameWhatIsKnown) {
-  EXPECT_EQ(LogText({}, std::nullopt, 0, {}, "text"), "text");
-  EXPECT_EQ(LogText({"j"}, 0, 2, {"w"}, "text"), "job=j tile=0 attempt=2 worker=w text");
+  EXPECT_EQ(LogText({}, "text"), "text");
+  const LogSubject subject{.job = {"j"}, .tile = 0, .attempt = 2, .worker = {"w"}};
+  EXPECT_EQ(LogText(subject, "text"), "job=j tile=0 attempt=2 worker=w text");
+}
+
+TEST(ServiceMain, LogObjectsHaveAFieldForEach) {
+  const std::chrono::system_clock::time_point time{std::chrono::milliseconds(1'700'000'000'042)};
+  EXPECT_EQ(LogJson("p", LogLevel::kInfo, {}, "text", time),
+            R"({"time":"2023-11-14T22:13:20.042Z","level":"info","program":"p","text":"text"})");
+  const LogSubject subject{.job = {"j"}, .tile = 0, .attempt = 2, .worker = {"w"}};
+  EXPECT_EQ(LogJson("p", LogLevel::kWarning, subject, "a \"b\"\n\xff", time),
+            R"({"time":"2023-11-14T22:13:20.042Z","level":"warning","program":"p","job":"j",)"
+            R"("tile":0,"attempt":2,"worker":"w","text":"a \"b\"\n)"
+            "\xef\xbf\xbd\"}");
 }
 
 TEST(ServiceMain, SignalsAreHeardByWhoWaits) {
