@@ -571,22 +571,36 @@ absl::Status RunLoad(const ServiceContext& context, ServiceResult& result) {
 // --- cost ------------------------------------------------------------------------------------
 
 absl::Status RunCost(const ServiceContext& context, ServiceResult& result) {
-  const std::string side = std::to_string(context.Pick(1024, 64));
   for (const char* const integrator : {"pt", "fpbgi"}) {
     if (context.options.quick && integrator == std::string_view("fpbgi")) continue;
     const bool pt = std::string_view(integrator) == "pt";
+    // Half a minute of one thread each, so that starting processes is not what is measured.
+    const std::string side = std::to_string(context.Pick(pt ? 1024 : 2560, 64));
     FP_ASSIGN_OR_RETURN(const auto farm, ServiceFarm::Create(context.programs));
     const AssetBundle asset = ServiceScene();
     const std::string scene = farm->File("scene.obj");
     FP_RETURN_IF_ERROR(WriteFileAtomically(scene, asset.files.at("scene.obj").bytes()));
-    const std::vector<std::string> job = {
-        scene,          "--integrator",    integrator,
-        "--resolution", side + "x" + side, "--eye",
-        "5,4,6",        "--target",        "0,0.7,0",
-        "--sun",        "1,2,0.5:3,3,2.5", "--sky",
-        "0.3,0.4,0.5",  "--paths",         context.options.quick ? "4" : "96",
-        "--points",     "100000",          "--log-level",
-        "error"};
+    const std::vector<std::string> job = {scene,
+                                          "--integrator",
+                                          integrator,
+                                          "--resolution",
+                                          side + "x" + side,
+                                          "--eye",
+                                          "5,4,6",
+                                          "--target",
+                                          "0,0.7,0",
+                                          "--sun",
+                                          "1,2,0.5:3,3,2.5",
+                                          "--sky",
+                                          "0.3,0.4,0.5",
+                                          "--paths",
+                                          context.options.quick ? "4" : "96",
+                                          "--quality",
+                                          pt ? "normal" : "fine",
+                                          "--points",
+                                          "100000",
+                                          "--log-level",
+                                          "error"};
     const auto run = [&](std::vector<std::string> args) -> absl::StatusOr<double> {
       FP_ASSIGN_OR_RETURN(const auto process,
                           ChildProcess::Start(args, {.log = farm->File("client.log")}));

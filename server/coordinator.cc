@@ -987,6 +987,7 @@ class CoordinatorImpl final : public Coordinator {
     scheduled.priority = stored.spec.priority;
     scheduled.number = stored.number;
     scheduled.tiles = job.total_tiles();
+    scheduled.frame_tiles = frame_tiles;
     for (const StoredTile& tile : committed) {
       if (tile.tile >= scheduled.tiles) continue;
       scheduled.committed.push_back(tile.tile);

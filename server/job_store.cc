@@ -455,7 +455,7 @@ class SqliteJobStore final : public JobStore {
     // Whoever finds nobody at work commits all that have come so far, for itself and the others.
     while (!mine.done) {
       if (leading_) {
-        batch_done_.wait(lock);
+        mine.wake.wait(lock);
         continue;
       }
       leading_ = true;
@@ -466,9 +466,13 @@ class SqliteJobStore final : public JobStore {
       lock.unlock();
       CommitBatch(batch);
       lock.lock();
-      for (PendingTile* one : batch) one->done = true;
+      for (PendingTile* one : batch) {
+        one->done = true;
+        one->wake.notify_one();
+      }
       leading_ = false;
-      batch_done_.notify_all();
+      // The others are not woken for nothing: of hundreds one is enough to go on.
+      if (!queue_.empty()) queue_.front()->wake.notify_one();
     }
     return mine.status;
   }
@@ -765,6 +769,7 @@ class SqliteJobStore final : public JobStore {
     uint64_t offset = 0;
     absl::Status status;
     bool done = false;  // guarded by queue_mutex_
+    std::condition_variable wake;
   };
   // The file that the tiles of a job are appended to now.
   struct Segment {
@@ -1208,7 +1213,6 @@ class SqliteJobStore final : public JobStore {
   sqlite3* db_ = nullptr;
 
   std::mutex queue_mutex_;
-  std::condition_variable batch_done_;
   std::deque<PendingTile*> queue_;     // guarded by queue_mutex_
   bool leading_ = false;               // somebody commits a batch; guarded by queue_mutex_
   std::mutex segments_mutex_;          // before mutex_

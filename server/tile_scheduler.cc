@@ -272,8 +272,14 @@ void TileScheduler::SetState(Job& job, uint32_t tile, TileState state) {
   TileState& now = job.tiles[tile].state;
   --count(now);
   ++count(state);
-  if (now == TileState::kQueued) job.queued.erase(tile);
-  if (state == TileState::kQueued && job.tiles[tile].open) job.queued.insert(tile);
+  if (now == TileState::kQueued) {
+    job.queued.erase(tile);
+    job.again.erase(tile);
+  }
+  if (state == TileState::kQueued && job.tiles[tile].open) {
+    job.queued.insert(tile);
+    if (job.tiles[tile].attempts > 0) job.again.insert(tile);
+  }
   now = state;
   Rerank(job);
 }
@@ -365,7 +371,12 @@ void TileScheduler::RemoveWorker(const WorkerId& id) {
     // A result that is being stored counts even if its worker has left.
     if (!leases_.at(lease).committing) EndLease(lease);
   }
-  workers_.erase(at);
+  EraseWorker(id);
+}
+
+void TileScheduler::EraseWorker(const WorkerId& id) {
+  workers_.erase(id);
+  for (const JobId& job : started_) jobs_.at(job).last_tiles.erase(id);
 }
 
 std::vector<WorkerStatus> TileScheduler::Workers() const {
@@ -458,7 +469,10 @@ LeaseGrant TileScheduler::Grant(const WorkerId& worker, Job& job, uint32_t tile,
     job.audits.at(tile).lease = grant.lease;
   } else {
     job.tiles[tile].leases.push_back(grant.lease);
-    if (!speculative) SetState(job, tile, TileState::kLeased);
+    if (!speculative) {
+      job.last_tiles[worker] = tile;
+      SetState(job, tile, TileState::kLeased);
+    }
   }
   Rerank(job);
   return grant;
@@ -483,13 +497,47 @@ std::optional<LeaseGrant> TileScheduler::Lease(const WorkerId& id) {
   for (const Rank& rank : ready_) {
     Job& job = jobs_.at(rank.id);
     if (!TakesFingerprint(job, worker)) continue;
-    for (const uint32_t tile : job.queued) {
-      const Tile& candidate = job.tiles[tile];
-      if (candidate.dead.contains(id) && AnotherWorkerCouldTake(job, candidate, id)) continue;
-      return Grant(id, job, tile, false, false);
+    if (const std::optional<uint32_t> tile = PickTile(job, id)) {
+      return Grant(id, job, *tile, false, false);
     }
   }
   return LeaseCopy(id, worker);
+}
+
+std::optional<uint32_t> TileScheduler::PickTile(Job& job, const WorkerId& id) {
+  const auto takes = [&](uint32_t tile) {
+    const Tile& candidate = job.tiles[tile];
+    return !candidate.dead.contains(id) || !AnotherWorkerCouldTake(job, candidate, id);
+  };
+  for (const uint32_t tile : job.again) {
+    if (takes(tile)) return tile;
+  }
+  if (job.again.size() == job.queued.size()) return std::nullopt;
+  // The others were never leased, so they have not failed on anybody.
+  const auto fresh_from = [&](uint32_t from) -> std::optional<uint32_t> {
+    for (auto at = job.queued.lower_bound(from); at != job.queued.end(); ++at) {
+      if (!job.again.contains(*at)) return *at;
+    }
+    return std::nullopt;
+  };
+  const uint32_t first = *fresh_from(0);
+  const auto last = job.last_tiles.find(id);
+  if (last != job.last_tiles.end() && last->second + 1 < job.tiles.size()) {
+    const uint32_t next = last->second + 1;
+    const uint32_t frame = job.spec.frame_tiles == 0 ? job.spec.tiles : job.spec.frame_tiles;
+    if (next / frame == first / frame && job.queued.contains(next) && !job.again.contains(next)) {
+      return next;
+    }
+  }
+  // Halves, quarters, eighths … of what is left of the first frame that is not done.
+  const uint32_t frame = job.spec.frame_tiles == 0 ? job.spec.tiles : job.spec.frame_tiles;
+  const uint32_t end = std::min((first / frame + 1) * frame, job.spec.tiles);
+  uint32_t reversed = 0;
+  uint32_t number = job.begun++;
+  for (int bit = 0; bit < 16; ++bit, number >>= 1) reversed = reversed << 1 | (number & 1);
+  const auto offset = static_cast<uint32_t>(uint64_t{end - first} * reversed >> 16);
+  const std::optional<uint32_t> tile = fresh_from(first + offset);
+  return tile && *tile < end ? *tile : first;
 }
 
 std::optional<LeaseGrant> TileScheduler::LeaseAudit(const WorkerId& id, const Worker& worker) {
@@ -959,7 +1007,7 @@ SchedulerNews TileScheduler::Tick() {
       news.forgotten.push_back(id);
     }
   }
-  for (const WorkerId& id : news.forgotten) workers_.erase(id);
+  for (const WorkerId& id : news.forgotten) EraseWorker(id);
   return news;
 }
 

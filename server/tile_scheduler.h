@@ -11,6 +11,10 @@
 //     processor used for stall_time: a thread hangs,
 //   - its job ends, or its job commits a tile of another fingerprint.
 // A queued tile is leased only when it is open (its frame is baked) and its job is not paused.
+//
+// Neighbours share work: a worker goes on with the tile after its last one, and begins, or begins
+// anew where others have been, as far from them as it can. What was tried before goes first.
+//
 // Committing takes two steps, since a result counts when it is durable: BeginCommit pins the lease,
 // FinishCommit ends it. In between the tile counts as leased and no other result is taken.
 //
@@ -69,7 +73,8 @@ struct ScheduledJob {
   int32_t priority = 0;
   uint64_t number = 0;  // order of submission: age decides between equal priorities
   uint32_t tiles = 0;
-  std::vector<uint32_t> committed;        // tiles that are done already
+  uint32_t frame_tiles = 0;         // of each frame, one after the other; 0: all are one frame's
+  std::vector<uint32_t> committed;  // tiles that are done already
   std::vector<std::string> committed_by;  // their workers' names; as many, or none: not known
   Digest fingerprint;                     // of the committed tiles; empty if there are none
   Duration max_time = Duration::max();    // from the first lease on
@@ -258,6 +263,9 @@ class TileScheduler {
     ScheduledJob spec;
     std::vector<Tile> tiles;
     std::set<uint32_t> queued;  // open tiles in state kQueued, in order
+    std::set<uint32_t> again;   // of these, the ones that were leased before
+    std::map<WorkerId, uint32_t> last_tiles;
+    uint32_t begun = 0;  // how often a worker began somewhere
     std::set<LeaseId> leases;
     TileCounts counts;
     Digest fingerprint;
@@ -317,12 +325,15 @@ class TileScheduler {
   bool AnotherWorkerCouldTake(const Job& job, const Tile& tile, const WorkerId& but) const;
   bool SomeWorkerCouldAudit(const Job& job, const Audit& audit) const;
   LeaseGrant Grant(const WorkerId& worker, Job& job, uint32_t tile, bool speculative, bool audit);
+  // A queued tile for the worker; none if all have failed on it and others could take them.
+  std::optional<uint32_t> PickTile(Job& job, const WorkerId& worker);
   std::optional<LeaseGrant> LeaseAudit(const WorkerId& id, const Worker& worker);
   std::optional<LeaseGrant> LeaseCopy(const WorkerId& id, const Worker& worker);
   // Takes the lease away from worker and tile; a tile without leases is queued again.
   void EndLease(const LeaseId& lease);
   std::string NameOfWorker(const WorkerId& id) const;
   void Heard(const WorkerId& id, Worker& worker);
+  void EraseWorker(const WorkerId& id);
   // Blames worker and tile for the loss of a lease, and tells of it; the tile may be set aside.
   void Blame(const LeaseGrant& grant, const std::string& cause, Fault fault, SchedulerNews& news);
   bool IsPoison(const Job& job, uint32_t tile);

@@ -2,6 +2,7 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <map>
 #include <random>
@@ -104,6 +105,11 @@ TEST_F(FarmJobs, FramesAreRenderedWhileLaterOnesAreBaked) {
   baker_->hold_from_s = 1e9;
   std::vector<TileWork> rest;
   for (int i = 0; i < 4; ++i) rest.push_back(LeaseOrDie(RegisterOrDie()));
+  // The frames in their order, the tiles of each in any.
+  EXPECT_EQ(rest[0].frame_index, 1u);
+  EXPECT_EQ(rest[1].frame_index, 1u);
+  std::sort(rest.begin(), rest.end(),
+            [](const TileWork& a, const TileWork& b) { return a.tile < b.tile; });
   EXPECT_EQ(rest[0].tile, 2u);
   EXPECT_EQ(rest[0].rect, first.rect);
   EXPECT_EQ(rest[0].frame.camera.eye.x, 0.2);

@@ -3,7 +3,9 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <map>
 #include <random>
+#include <set>
 
 namespace farpoint {
 namespace {
@@ -351,6 +353,31 @@ TEST_F(TileSchedulerTest, ATileOfAWorkerKnownToBeSlowIsCopiedAtOnce) {
   ASSERT_TRUE(copy.has_value());
   EXPECT_TRUE(copy->speculative);
   EXPECT_EQ(copy->tile, held->tile);
+}
+
+TEST_F(TileSchedulerTest, WorkersKeepToNeighboursFarFromEachOther) {
+  AddJob("a", 64);
+  std::vector<WorkerId> workers;
+  std::map<WorkerId, std::vector<uint32_t>> tiles;
+  for (int i = 0; i < 4; ++i) workers.push_back(AddWorker("w" + std::to_string(i)));
+  for (int round = 0; round < 16; ++round) {
+    for (const WorkerId& w : workers) tiles[w].push_back(Render(w));
+  }
+  std::set<uint32_t> starts;
+  for (const auto& [worker, mine] : tiles) {
+    for (size_t i = 1; i < mine.size(); ++i) EXPECT_EQ(mine[i], mine[i - 1] + 1);
+    starts.insert(mine.front());
+  }
+  EXPECT_THAT(starts, ElementsAre(0, 16, 32, 48));
+}
+
+TEST_F(TileSchedulerTest, ATileThatWasTriedGoesFirst) {
+  AddJob("a", 10);
+  const WorkerId dies = AddWorker("dies"), other = AddWorker("other");
+  Render(other);
+  const auto lost = scheduler_.Lease(dies);
+  scheduler_.RemoveWorker(dies);
+  EXPECT_EQ(scheduler_.Lease(other)->tile, lost->tile);
 }
 
 // --- Audits ---
