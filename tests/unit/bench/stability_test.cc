@@ -31,8 +31,6 @@ constexpr Known kKnown[] = {
     {"scale-powers-of-two", "fpbgi", "scale 2^-30"},
     {"scale-powers-of-two", "pbgi", "scale 2^-30"},
     {"scale-powers-of-two", "pt", "scale 2^-30"},
-    // Records lie in cells of the world whose side is a power of two in metres.
-    {"scale-thousands", "fpbgi", "scale"},
     // Sides that only someone inside a closed object sees are left out of the gather.
     {"lights-on-surfaces", "pbgi", "a light inside the tall box"},
     {"cameras-in-walls", "pbgi", "inside the tall box: largest"},
