@@ -1075,9 +1075,13 @@ class CoordinatorImpl final : public Coordinator {
     const JobId& id = job.stored.id;
     const TileCounts counts = scheduler_.Counts(id);
     if (IsFinal(job.stored.state) || counts.committed + counts.failed != counts.total) return;
+    if (counts.failed > 0 && !scheduler_.MayGiveUp(id)) {
+      unfinished_.insert(id);
+      return;
+    }
     switch (scheduler_.Audits(id)) {
       case AuditState::kOpen:
-        waiting_for_audits_.insert(id);  // the ticker looks again
+        unfinished_.insert(id);  // the ticker looks again
         return;
       case AuditState::kUndecided: {
         const std::vector<uint32_t> disputed = scheduler_.DisputedTiles(id);
@@ -1092,7 +1096,7 @@ class CoordinatorImpl final : public Coordinator {
       case AuditState::kNone:
         break;
     }
-    waiting_for_audits_.erase(id);
+    unfinished_.erase(id);
     if (counts.failed > 0) {
       FailJob(job, PoisonError(job));
       return;
@@ -1222,8 +1226,8 @@ class CoordinatorImpl final : public Coordinator {
       if (gap > options_.silence_time / 2) scheduler_.Forgive(gap);
       const SchedulerNews news = scheduler_.Tick();
       HandleNews(news);
-      const std::set<JobId> audited = std::exchange(waiting_for_audits_, {});
-      for (const JobId& id : audited) {
+      const std::set<JobId> waited = std::exchange(unfinished_, {});
+      for (const JobId& id : waited) {
         if (const auto at = jobs_.find(id); at != jobs_.end()) FinishIfDone(*at->second);
       }
       const auto now = std::chrono::steady_clock::now();
@@ -1242,7 +1246,7 @@ class CoordinatorImpl final : public Coordinator {
         next_purge = now + std::chrono::hours(1);
         PurgeOld();
       }
-      if (!news.lost.empty() || !news.failed.empty() || !audited.empty()) NotifyAll();
+      if (!news.lost.empty() || !news.failed.empty() || !waited.empty()) NotifyAll();
       stop_ticker_.wait_for(lock, period, [this] { return stopping_; });
     }
   }
@@ -1475,8 +1479,9 @@ class CoordinatorImpl final : public Coordinator {
   std::optional<BakeInWork> bake_in_work_;      // guarded by mutex_
   std::set<Digest> released_;                   // guarded by mutex_
   std::map<JobId, uint64_t> saved_counters_;    // guarded by mutex_
-  std::set<JobId> waiting_for_audits_;          // all tiles committed; guarded by mutex_
-  bool draining_ = false, stopping_ = false;    // guarded by mutex_
+  // No tile is left, but audits or workers that may come back; guarded by mutex_.
+  std::set<JobId> unfinished_;
+  bool draining_ = false, stopping_ = false;  // guarded by mutex_
   std::thread ticker_, bakery_;
 };
 

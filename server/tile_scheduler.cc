@@ -245,6 +245,11 @@ AuditState TileScheduler::Audits(const JobId& id) const {
   return undecided ? AuditState::kUndecided : AuditState::kNone;
 }
 
+bool TileScheduler::MayGiveUp(const JobId& id) const {
+  const auto at = jobs_.find(id);
+  return at == jobs_.end() || clock_.Now() >= at->second.comeback_until;
+}
+
 std::vector<uint32_t> TileScheduler::DisputedTiles(const JobId& id) const {
   std::vector<uint32_t> tiles;
   const auto at = jobs_.find(id);
@@ -899,6 +904,7 @@ void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, Fau
   }
   for (const LeaseId& lease : ending) EndLease(lease);
   SetState(job, grant.tile, TileState::kFailed);
+  if (fault == Fault::kVanished) job.comeback_until = clock_.Now() + options_.comeback_time;
   news.set_aside.push_back({grant.job, grant.tile});
 }
 

@@ -23,7 +23,8 @@
 // job when nothing else is left. Workers that just vanish may be a matter of the farm and not of
 // the tile: where more than three times as many vanished from other tiles lately, only
 // max_tile_failures counts. A worker that is heard of again did not die: what it was blamed for is
-// forgiven. A tile that failed before is leased as `careful`.
+// forgiven, and a tile that was set aside by that is queued again. A tile that failed before is
+// leased as `careful`.
 //
 // Audits. A share audit_fraction of the committed tiles, drawn at random, is rendered again by
 // another worker, which cannot tell such a lease from others; the tile counts as committed all the
@@ -61,7 +62,9 @@ struct SchedulerOptions {
   uint32_t max_worker_failures = 3;
   Duration set_aside_time = std::chrono::seconds(60);
   Duration forget_worker_after = std::chrono::seconds(60);  // without leases and silent
-  double audit_fraction = 0;                                // [0, 1]
+  // How long workers that vanished may come back before their tile is given up.
+  Duration comeback_time = std::chrono::seconds(3);
+  double audit_fraction = 0;  // [0, 1]
   // How long a disagreement waits for a worker that may decide it.
   Duration decide_time = std::chrono::seconds(60);
   uint64_t audit_seed = 0;  // 0: random, so that nobody can tell which tiles
@@ -186,6 +189,9 @@ class TileScheduler {
   uint32_t Leasable(const JobId& job) const;  // queued and open tiles
   JobReport Report(const JobId& job) const;
   AuditState Audits(const JobId& job) const;
+  // Whether the tiles that are set aside stay so: false while a worker that vanished from one may
+  // still come back.
+  bool MayGiveUp(const JobId& job) const;
   // Committed tiles about which workers disagree.
   std::vector<uint32_t> DisputedTiles(const JobId& job) const;
 
@@ -265,7 +271,8 @@ class TileScheduler {
     std::set<uint32_t> queued;  // open tiles in state kQueued, in order
     std::set<uint32_t> again;   // of these, the ones that were leased before
     std::map<WorkerId, uint32_t> last_tiles;
-    uint32_t begun = 0;  // how often a worker began somewhere
+    uint32_t begun = 0;          // how often a worker began somewhere
+    TimePoint comeback_until{};  // of workers that vanished from tiles which are set aside
     std::set<LeaseId> leases;
     TileCounts counts;
     Digest fingerprint;

@@ -29,6 +29,7 @@ class CoordinatorTest : public ::testing::Test {
     options.limits = limits_;
     options.silence_time = milliseconds(300);
     options.retention = retention_;
+    options.audit_fraction = audit_fraction_;
     auto opened = Coordinator::Open(std::move(options));
     ASSERT_TRUE(opened.ok()) << opened.status();
     coordinator_ = *std::move(opened);
@@ -49,9 +50,11 @@ class CoordinatorTest : public ::testing::Test {
     EXPECT_TRUE(id.ok()) << id.status();
     return id.ok() ? *id : JobId{};
   }
-  WorkerId RegisterOrDie() {
-    const auto welcome = coordinator_->Register(
-        {.version = FARPOINT_VERSION, .fingerprint = TestFingerprint(), .threads = 1, .name = "w"});
+  WorkerId RegisterOrDie(const std::string& name = "w") {
+    const auto welcome = coordinator_->Register({.version = FARPOINT_VERSION,
+                                                 .fingerprint = TestFingerprint(),
+                                                 .threads = 1,
+                                                 .name = name});
     EXPECT_TRUE(welcome.ok()) << welcome.status();
     return welcome.ok() ? welcome->id : WorkerId{};
   }
@@ -93,6 +96,7 @@ class CoordinatorTest : public ::testing::Test {
   std::shared_ptr<FakeBaker> baker_ = std::make_shared<FakeBaker>();
   JobLimits limits_;
   std::chrono::hours retention_{24};
+  double audit_fraction_ = 0;
   std::unique_ptr<Coordinator> coordinator_;
 };
 

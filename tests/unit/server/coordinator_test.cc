@@ -146,6 +146,96 @@ TEST_F(CoordinatorTest, DamagedResultsAreRefusedAndTheTileIsRenderedAgain) {
   EXPECT_EQ(WaitForEnd(job), JobState::kDone);
 }
 
+// Two workers, one of which lies: a third one decides, and the image is right all the same.
+TEST_F(CoordinatorTest, AuditsFindWrongPixelsAndOpenThemAgain) {
+  audit_fraction_ = 1;
+  TempFolder folder;
+  Open(folder.path());
+  const JobId job = SubmitOrDie(Spec("scene", 64, 32));
+  const WorkerId liar = RegisterOrDie("liar");
+  const auto wrong = [](const TileWork& work) {
+    TileResult result;
+    result.lease = work.lease;
+    result.attempt = work.attempt;
+    Film film = FakeTile(work.rect, work.frame.settings.layers);
+    film.Plane(Layer::kBeauty, 0)[0] = 0.125f;
+    result.bytes = Blob::FromVector(EncodeFilm(film));
+    result.sha256 = result.bytes.Hash();
+    return result;
+  };
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_TRUE(coordinator_->Return(liar, wrong(LeaseOrDie(liar)))->accepted);
+  }
+  // All are committed, and nobody is there who could look: it would be done.
+  EXPECT_EQ(WaitForEnd(job), JobState::kDone);
+
+  const JobId second = SubmitOrDie(Spec("scene", 64, 32));
+  const WorkerId good = RegisterOrDie("good"), third = RegisterOrDie("third");
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_TRUE(coordinator_->Return(liar, wrong(LeaseOrDie(liar)))->accepted);
+  }
+  EXPECT_EQ(coordinator_->Status(second)->state, JobState::kRendering) << "audits are open";
+  EXPECT_EQ(coordinator_->Status(second)->tiles, (TileCounts{.committed = 2, .total = 2}));
+  const TileWork audit = LeaseOrDie(good);
+  EXPECT_EQ(audit.job, second);
+  EXPECT_FALSE(audit.careful);
+  EXPECT_TRUE(coordinator_->Return(good, Render(audit))->accepted);
+  const TileWork decision = LeaseOrDie(third);
+  EXPECT_EQ(decision.tile, audit.tile);
+  EXPECT_TRUE(coordinator_->Return(third, Render(decision))->accepted);
+  EXPECT_EQ(coordinator_->Status(second)->tiles, (TileCounts{.queued = 2, .total = 2}));
+  EXPECT_FALSE(coordinator_->FetchTile(second, 0).ok()) << "the wrong bytes are gone";
+  // The good one renders them again, the third one looks.
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_TRUE(coordinator_->Return(good, Render(LeaseOrDie(good)))->accepted);
+  }
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_TRUE(coordinator_->Return(third, Render(LeaseOrDie(third)))->accepted);
+  }
+  EXPECT_EQ(WaitForEnd(second), JobState::kDone);
+  for (uint32_t tile = 0; tile < 2; ++tile) {
+    const auto data = coordinator_->FetchTile(second, tile);
+    ASSERT_TRUE(data.ok()) << data.status();
+    const auto film = DecodeFilm(data->bytes.bytes());
+    EXPECT_EQ(ImageHash(*film), ImageHash(FakeTile(film->rect(), {Layer::kBeauty, Layer::kDepth})));
+  }
+  const auto explained = coordinator_->Explain(second);
+  ASSERT_TRUE(explained.ok());
+  EXPECT_THAT(explained->lines, Contains(HasSubstr("'liar' returned pixels that two others did")));
+  for (const WorkerStatus& worker : coordinator_->Workers()) {
+    EXPECT_EQ(worker.set_aside, worker.name == "liar");
+  }
+}
+
+TEST_F(CoordinatorTest, APoisonousTileIsNamedWhenAllOthersAreDone) {
+  Open();
+  const JobId job = SubmitOrDie(Spec("scene", 64, 32));
+  for (int i = 0; i < 3; ++i) {
+    const WorkerId worker = RegisterOrDie();
+    const TileWork work = LeaseOrDie(worker);
+    EXPECT_EQ(work.tile, 0u);
+    EXPECT_EQ(work.careful, i > 0);
+    EXPECT_TRUE(coordinator_
+                    ->ReportFailure(worker, work.lease, false,
+                                    absl::AbortedError("the worker crashed in block 0, 0"))
+                    .ok());
+  }
+  EXPECT_EQ(coordinator_->Status(job)->state, JobState::kRendering);
+  EXPECT_EQ(coordinator_->Status(job)->tiles, (TileCounts{.queued = 1, .failed = 1, .total = 2}));
+  const WorkerId good = RegisterOrDie();
+  EXPECT_TRUE(coordinator_->Return(good, Render(LeaseOrDie(good)))->accepted);
+  EXPECT_EQ(WaitForEnd(job), JobState::kFailed);
+  const std::string error(coordinator_->Status(job)->error.message());
+  EXPECT_THAT(error, HasSubstr("tile 0 (pixels 0 to 31 across, 0 to 31 down)"));
+  EXPECT_THAT(error, HasSubstr("3 workers"));
+  EXPECT_THAT(error, HasSubstr("crashed in block 0, 0"));
+  EXPECT_TRUE(coordinator_->Requeue(job, false).ok());
+  const TileWork again = LeaseOrDie(good);
+  EXPECT_EQ(again.tile, 0u);
+  EXPECT_TRUE(coordinator_->Return(good, Render(again))->accepted);
+  EXPECT_EQ(coordinator_->Status(job)->state, JobState::kDone);
+}
+
 TEST_F(CoordinatorTest, GarbageThreeTimesFailsTheJob) {
   Open();
   const JobId job = SubmitOrDie(Spec("scene", 32, 32));

@@ -1,8 +1,11 @@
 // The whole way over real sockets on loopback: a job by gRPC, two workers with a fake renderer, one
 // of which vanishes in mid-tile.
 #include <gmock/gmock.h>
+#include <grpcpp/server.h>
+#include <grpcpp/server_builder.h>
 #include <gtest/gtest.h>
 
+#include <atomic>
 #include <thread>
 
 #include "proto/convert.h"
@@ -338,6 +341,142 @@ TEST_F(ServicesTest, BlobsGoThereAndBackFromAnyOffset) {
   const Digest unknown = Sha256().Update("unknown").Finish();
   EXPECT_TRUE(
       absl::IsNotFound(link->Stream(unknown, 0, [](auto, auto) { return absl::OkStatus(); })));
+}
+
+TEST_F(ServicesTest, EveryChunkHasItsHash) {
+  const std::string content(2 * kChunkBytes + 5, 'c');
+  const Digest digest = Sha256().Update(content).Finish();
+  ASSERT_TRUE(Put(digest.Hex(), content, content.size(), kChunkBytes).ok());
+  for (const uint64_t offset : {uint64_t{0}, uint64_t{kChunkBytes}, uint64_t{kChunkBytes + 7}}) {
+    Call call;
+    v1::GetBlobRequest request;
+    request.set_sha256(digest.Hex());
+    request.set_offset_bytes(offset);
+    const auto stream = blobs_->Get(&call, request);
+    v1::GetBlobChunk chunk;
+    uint64_t at = offset;
+    while (stream->Read(&chunk)) {
+      const Digest hash = Sha256().Update(chunk.data()).Finish();
+      EXPECT_EQ(chunk.data_sha256(),
+                std::string(reinterpret_cast<const char*>(hash.bytes.data()), hash.bytes.size()));
+      at += chunk.data().size();
+      // From the first whole chunk on, all begin where chunks do.
+      EXPECT_TRUE(at % kChunkBytes == 0 || at == content.size());
+    }
+    EXPECT_TRUE(stream->Finish().ok());
+    EXPECT_EQ(at, content.size());
+  }
+}
+
+TEST_F(ServicesTest, ABrokenConnectionCostsTheLeaseBeforeSilenceDoes) {
+  CoordinatorOptions options;
+  options.baker = std::make_shared<FakeBaker>();
+  options.silence_time = std::chrono::hours(1);  // so that nothing else can
+  options.reconnect_time = milliseconds(50);
+  auto coordinator = Coordinator::Open(std::move(options));
+  ASSERT_TRUE(coordinator.ok());
+  auto server = GrpcServer::Start(**coordinator, "127.0.0.1:0");
+  ASSERT_TRUE(server.ok());
+  const std::string address = "127.0.0.1:" + std::to_string((*server)->port());
+  const Blob blob = Blob::FromString("scene");
+  ASSERT_TRUE((*coordinator)->PutBlob(blob.Hash(), blob).ok());
+  JobSpec spec;
+  spec.asset_root = "a.gltf";
+  spec.asset_files["a.gltf"] = blob.Hash();
+  spec.film = {.width = 32, .height = 32, .crop = {0, 0, 32, 32}};
+  const auto job = (*coordinator)->Submit(spec, "");
+  ASSERT_TRUE(job.ok());
+  const auto status = [&] { return *(*coordinator)->Status(*job); };
+  const auto wait_for = [&](const auto& holds) {
+    for (int i = 0; i < 2000 && !holds(); ++i) std::this_thread::sleep_for(milliseconds(5));
+    return holds();
+  };
+  const WorkerHello hello{.version = FARPOINT_VERSION, .fingerprint = Sha256().Finish()};
+  auto link = GrpcLink::Connect(address);
+  const auto welcome = link->Register(hello);
+  ASSERT_TRUE(welcome.ok()) << welcome.status();
+  link->Attend(welcome->id);
+  const auto work = link->Lease(welcome->id, milliseconds(5000));
+  ASSERT_TRUE(work.ok() && work->has_value());
+  // The stream may open a moment after the lease was given.
+  std::this_thread::sleep_for(milliseconds(300));
+  EXPECT_EQ(status().tiles.leased, 1u);
+  link.reset();
+  EXPECT_TRUE(wait_for([&] { return status().tiles.leased == 0; }));
+  EXPECT_EQ(status().reissued, 1u);
+  // Nobody has left: it is known, and may come back.
+  EXPECT_EQ((*coordinator)->Workers().size(), 1u);
+  link = GrpcLink::Connect(address);
+  link->Attend(welcome->id);
+  const auto again = link->Lease(welcome->id, milliseconds(5000));
+  ASSERT_TRUE(again.ok() && again->has_value()) << again.status();
+  EXPECT_EQ((*again)->attempt, 2u);
+}
+
+// Answers nothing but how long each caller would wait.
+class DeadlineKeeper final : public v1::WorkerService::Service {
+ public:
+  grpc::Status Register(grpc::ServerContext* c, const v1::RegisterRequest*,
+                        v1::RegisterResponse*) override {
+    return Note(c);
+  }
+  grpc::Status Lease(grpc::ServerContext* c, const v1::LeaseRequest*, v1::LeaseResponse*) override {
+    return Note(c);
+  }
+  grpc::Status Renew(grpc::ServerContext* c, const v1::RenewRequest*, v1::RenewResponse*) override {
+    return Note(c);
+  }
+  grpc::Status Return(grpc::ServerContext* c, grpc::ServerReader<v1::ReturnChunk>*,
+                      v1::ReturnResponse*) override {
+    return Note(c);
+  }
+  grpc::Status ReportFailure(grpc::ServerContext* c, const v1::ReportFailureRequest*,
+                             v1::ReportFailureResponse*) override {
+    return Note(c);
+  }
+  grpc::Status Leave(grpc::ServerContext* c, const v1::LeaveRequest*, v1::LeaveResponse*) override {
+    return Note(c);
+  }
+  grpc::Status Attend(grpc::ServerContext* c, const v1::AttendRequest*,
+                      grpc::ServerWriter<v1::AttendResponse>*) override {
+    ++attends;
+    return Note(c);
+  }
+  grpc::Status Note(grpc::ServerContext* context) {
+    const auto left = context->deadline() - std::chrono::system_clock::now();
+    ++calls;
+    if (left > std::chrono::hours(2)) ++endless;
+    return {grpc::StatusCode::UNIMPLEMENTED, "only looks"};
+  }
+  std::atomic<int> calls = 0, endless = 0, attends = 0;
+};
+
+TEST(WorkerLink, EveryCallHasADeadline) {
+  DeadlineKeeper keeper;
+  grpc::ServerBuilder builder;
+  int port = 0;
+  builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
+  builder.RegisterService(&keeper);
+  const std::unique_ptr<grpc::Server> server = builder.BuildAndStart();
+  ASSERT_NE(server, nullptr);
+  const auto link = GrpcLink::Connect("127.0.0.1:" + std::to_string(port));
+  const WorkerId worker{"w"};
+  TileResult result;
+  result.lease = {"l"};
+  result.bytes = Blob::FromString("bytes");
+  EXPECT_FALSE(link->Register({.version = FARPOINT_VERSION}).ok());
+  EXPECT_FALSE(link->Lease(worker, milliseconds(10)).ok());
+  EXPECT_FALSE(link->Renew(worker, {"l"}, {}).ok());
+  EXPECT_FALSE(link->Return(worker, result).ok());
+  EXPECT_FALSE(link->ReportFailure(worker, {"l"}, true, absl::OkStatus()).ok());
+  link->Attend(worker);
+  for (int i = 0; i < 2000 && keeper.attends == 0; ++i) {
+    std::this_thread::sleep_for(milliseconds(5));
+  }
+  EXPECT_FALSE(link->Leave(worker).ok());
+  EXPECT_EQ(keeper.calls, 7);
+  EXPECT_EQ(keeper.endless, 0);
+  server->Shutdown();
 }
 
 TEST_F(ServicesTest, DamagedUploadsAreRefused) {

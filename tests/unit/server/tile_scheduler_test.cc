@@ -191,6 +191,9 @@ TEST_F(TileSchedulerTest, ATileThatKillsThreeWorkersIsSetAsideAndTheOthersGoOn) 
                 AllOf(HasSubstr("nothing was heard"), HasSubstr("block 3, 4")));
     ASSERT_EQ(news.set_aside.size(), i == 2 ? 1u : 0u);
   }
+  EXPECT_FALSE(scheduler_.MayGiveUp({"a"}));
+  clock_.Advance(options_.comeback_time);
+  EXPECT_TRUE(scheduler_.MayGiveUp({"a"}));
   EXPECT_EQ(scheduler_.Counts({"a"}), (TileCounts{.queued = 1, .failed = 1, .total = 2}));
   const JobReport report = scheduler_.Report({"a"});
   ASSERT_EQ(report.troubled.size(), 1u);
@@ -306,6 +309,7 @@ TEST_F(TileSchedulerTest, WhoComesBackDidNotDieOfItsTile) {
     scheduler_.Tick();
   }
   EXPECT_EQ(scheduler_.Counts({"a"}).failed, 1u);
+  EXPECT_FALSE(scheduler_.MayGiveUp({"a"})) << "somebody may come back";
   EXPECT_TRUE(scheduler_.Touch(stopped[0]));
   EXPECT_EQ(scheduler_.Counts({"a"}).queued, 1u);
 }

@@ -3,6 +3,8 @@
 #include <gtest/gtest.h>
 
 #include <map>
+#include <string>
+#include <vector>
 
 #include "core/image/film.h"
 #include "tests/unit/server/fake_render.h"
@@ -123,6 +125,37 @@ TEST_F(TileRunnerTest, AFailureLeavesTheNextTileUnharmed) {
   EXPECT_TRUE(absl::IsNotFound(runner.Run(work, progress_, cancel_).status()));
   source_.Add("missing");
   EXPECT_TRUE(runner.Run(work, progress_, cancel_).ok());
+}
+
+TEST_F(TileRunnerTest, ACarefulTileTellsOfEachBlockBeforeIt) {
+  std::vector<std::string> seen;  // places told and blocks begun, in order
+  const FakeRenderer renderer([&](const PixelRect& rect, const std::atomic<bool>*) {
+    seen.push_back("render " + std::to_string(rect.x0) + "," + std::to_string(rect.y0));
+    return rect.x0 == 32 && rect.y0 == 32 && seen.size() > 100 ? absl::InternalError("boom")
+                                                               : absl::OkStatus();
+  });
+  TileRunner runner(renderer, source_, executor_, 1);
+  // Cut by a crop on two sides.
+  const PixelRect rect{0, 0, 50, 64};
+  TileWork work = Work("j", "scene", rect);
+  const auto plain = runner.Run(work, progress_, cancel_);
+  ASSERT_TRUE(plain.ok()) << plain.status();
+  EXPECT_EQ(progress_.place(), "");
+  EXPECT_TRUE(progress_.rendering);
+  seen.clear();
+  work.careful = true;
+  progress_.tell = [&] { seen.push_back("told " + progress_.place().substr(0, 10)); };
+  const auto careful = runner.Run(work, progress_, cancel_);
+  ASSERT_TRUE(careful.ok()) << careful.status();
+  EXPECT_EQ(careful->sha256, plain->sha256);
+  EXPECT_EQ(careful->stats.counts.at("receivers"), plain->stats.counts.at("receivers"));
+  EXPECT_EQ(seen, (std::vector<std::string>{"told block 0, 0", "render 0,0", "told block 1, 0",
+                                            "render 32,0", "told block 0, 1", "render 0,32",
+                                            "told block 1, 1", "render 32,32"}));
+  seen.resize(100);
+  const auto failed = runner.Run(work, progress_, cancel_);
+  EXPECT_EQ(failed.status().code(), absl::StatusCode::kInternal);
+  EXPECT_NE(failed.status().message().find("block 1, 1"), std::string_view::npos);
 }
 
 }  // namespace
