@@ -26,6 +26,10 @@ function compact(value) {
   return value >= 1000 ? value.toLocaleString('en', {maximumFractionDigits: 0}) : +value.toPrecision(3);
 }
 
+function counted(count, noun) {
+  return `${compact(count)} ${noun}${count === 1 ? '' : 's'}`;
+}
+
 // --- The coordinator ---
 
 class Refused extends Error {
@@ -141,8 +145,8 @@ function showOverview() {
   const queued = overview.jobs.filter((job) => ['queued', 'baking', 'rendering'].includes(job.state))
                      .reduce((sum, job) => sum + job.tiles.queued, 0);
   byId('summary').textContent =
-      `${overview.jobs.length} jobs · ${overview.workers.length} workers, ${busy} busy · ` +
-      `${compact(queued)} tiles queued · ${overview.version}` +
+      `${counted(overview.jobs.length, 'job')} · ${counted(overview.workers.length, 'worker')}, ${busy} busy · ` +
+      `${counted(queued, 'tile')} queued · ${overview.version}` +
       (overview.caller ? ` · ${overview.caller} (${overview.role})` : '');
   showJobs();
   showWorkers();
@@ -206,7 +210,7 @@ function showFacts(job) {
   const {tiles, frames} = job;
   const facts = {
     state: job.state,
-    'left': job.eta_s !== undefined ? duration(job.eta_s) : kDash,
+    left: job.eta_s ? duration(job.eta_s) : kDash,
     tiles: `${tiles.committed} of ${tiles.total}, ${tiles.leased} in work, ${tiles.queued} queued` +
         (tiles.failed ? `, ${tiles.failed} failed` : ''),
     priority: job.priority,
