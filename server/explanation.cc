@@ -4,6 +4,7 @@
 #include <cstdio>
 #include <ctime>
 #include <string>
+#include <string_view>
 #include <utility>
 
 namespace farpoint {
@@ -205,13 +206,49 @@ std::string StagesText(const Stats& stats) {
   return text;
 }
 
-std::string SkippedText(const Stats& stats, const std::string& but) {
-  std::string text;
+// Why what a counter of `skipped` counts was not computed; empty: unknown to this version.
+std::string_view WhySkipped(std::string_view counter) {
+  constexpr std::pair<std::string_view, std::string_view> kWhy[] = {
+      {"bake_stages", "an earlier bake had the same"},
+      {"bakes_without_light", "nothing sends light"},
+      {"black_hits", "what paths met reflects nothing"},
+      {"black_receivers", "they reflect nothing"},
+      {"blocks_without_gather", "no receiver of theirs shows indirect light"},
+      {"blocks_without_receivers", "they see the background only"},
+      {"clusters", "others serve their places well enough"},
+      {"environment_terms", "there is no environment"},
+      {"hits_read_from_surfels", "the light of surfels is known"},
+      {"nodes_below_horizon", "below the horizons of all receivers of a cluster"},
+      {"nodes_hidden", "behind full pixels"},
+      {"nodes_invisible_side", "only sides within closed objects would be seen"},
+      {"objects_kept", "their surfels are those of an earlier bake"},
+      {"objects_repeated", "they lie exactly where others do"},
+      {"pixels_hidden", "full already"},
+      {"scene_broadcasts", "workers have the scene"},
+      {"shadow_rays", "their lights cannot reach"},
+      {"subtrees_hidden", "behind full pixels"},
+      {"surfel_sides_black", "they reflect nothing"},
+      {"surfel_sides_inside", "within closed objects that no light reaches"},
+      {"surfels_kept", "of an earlier bake"},
+      {"surfels_shaded_kept", "lit alike in an earlier bake"},
+      {"textures", "no surface shows them, or another is the same"},
+      {"unlit_receivers", "nothing sends light"},
+  };
+  for (const auto& [name, why] : kWhy) {
+    if (name == counter) return why;
+  }
+  return {};
+}
+
+// A line for each counter that is not 0.
+void ExplainSkipped(const Stats& stats, const std::string& of, std::string_view but,
+                    std::vector<std::string>& lines) {
   for (const auto& [name, count] : stats.skipped) {
     if (name == but || count == 0) continue;
-    text += (text.empty() ? "" : ", ") + name + " " + std::to_string(count);
+    const std::string_view why = WhySkipped(name);
+    lines.push_back(of + ": skipped " + name + " " + std::to_string(count) +
+                    (why.empty() ? "" : ": " + std::string(why)));
   }
-  return text;
 }
 
 void ExplainWork(const ExplanationFacts& facts, std::vector<std::string>& lines) {
@@ -225,11 +262,9 @@ void ExplainWork(const ExplanationFacts& facts, std::vector<std::string>& lines)
                       " taken from an earlier bake of the same scene");
     }
     if (!computed.empty()) lines.push_back("bake: computed " + computed);
-    const std::string skipped = SkippedText(facts.bake_stats, "bake");
-    if (!skipped.empty()) lines.push_back("bake: skipped " + skipped);
+    ExplainSkipped(facts.bake_stats, "bake", "bake", lines);
   }
-  const std::string skipped = SkippedText(facts.tile_stats, "");
-  if (!skipped.empty()) lines.push_back("tiles: skipped " + skipped);
+  ExplainSkipped(facts.tile_stats, "tiles", "", lines);
 }
 
 }  // namespace

@@ -149,13 +149,16 @@ TEST(Explanation, TellsWhatWasComputedReusedAndSkipped) {
   facts.bake_stats.wall_seconds[static_cast<size_t>(Stage::kTree)] = 2;
   facts.bake_stats.seconds[static_cast<size_t>(Stage::kShade)] = 0.25;
   facts.bake_stats.skipped = {{"bake", 2}, {"textures", 4}, {"nothing", 0}};
-  facts.tile_stats.skipped = {{"blocks", 6}};
+  facts.tile_stats.skipped = {{"nodes_hidden", 6}, {"of_a_newer_worker", 7}};
   const Explanation explanation = Explain(facts);
   EXPECT_THAT(explanation.lines,
               Contains("bake: 2 of 3 frames taken from an earlier bake of the same scene"));
   EXPECT_THAT(explanation.lines, Contains("bake: computed shade 0.25 s, tree 2 s"));
-  EXPECT_THAT(explanation.lines, Contains("bake: skipped textures 4"));
-  EXPECT_THAT(explanation.lines, Contains("tiles: skipped blocks 6"));
+  EXPECT_THAT(explanation.lines, Contains("bake: skipped textures 4: no surface shows them, or "
+                                          "another is the same"));
+  EXPECT_THAT(explanation.lines, Contains("tiles: skipped nodes_hidden 6: behind full pixels"));
+  EXPECT_THAT(explanation.lines, Contains("tiles: skipped of_a_newer_worker 7"));
+  EXPECT_THAT(explanation.lines, Not(Contains(HasSubstr("nothing 0"))));
 }
 
 }  // namespace
