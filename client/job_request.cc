@@ -75,7 +75,9 @@ absl::Status AddEnvironment(EnvironmentOverride& environment, AssetBundle& asset
 v1::RenderJob ImageJob(JobSpec spec) {
   const RenderSettings defaults;
   spec.settings.tile_px = defaults.tile_px;
-  spec.settings.no_skip = defaults.no_skip;
+  // Only cuts change by it: nodes below the horizon are part of them.
+  const bool cuts = spec.settings.point_based() && spec.settings.fill_in_force() == Fill::kCut;
+  if (!cuts) spec.settings.no_skip = defaults.no_skip;
   spec.title.clear();
   spec.priority = 0;
   spec.after.clear();
@@ -85,7 +87,7 @@ v1::RenderJob ImageJob(JobSpec spec) {
   v1::RenderJob wire = ToWire(spec);
   wire.clear_limits();
   wire.mutable_settings()->clear_tile_px();
-  wire.mutable_settings()->clear_no_skip();
+  if (!cuts) wire.mutable_settings()->clear_no_skip();
   return wire;
 }
 

@@ -509,7 +509,9 @@ constexpr RenderFlag kRenderFlags[] = {
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.tile_px);
      }},
-    {"--no-skip", "", kSpeed, "compute also what the scene does not need",
+    {"--no-skip", "", kMethod,
+     "compute also what the scene does not need; cuts then hold nodes below the horizon, which "
+     "changes them a little",
      [](std::string_view, JobEdit& edit) {
        edit.spec.settings.no_skip = true;
        return absl::OkStatus();

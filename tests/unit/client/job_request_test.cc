@@ -230,6 +230,21 @@ TEST(JobHash, IsDeafToWhatChangesNoPixel) {
   EXPECT_EQ(ImageSettingsJson(spec), ImageSettingsJson(other));
 }
 
+// Cuts leave out nodes below the horizon, which changes them a little.
+TEST(JobHash, HearsOfSkippingWhereCutsAreMade) {
+  for (const int way : {0, 1, 2, 3}) {
+    JobSpec spec = SomeSpec();
+    if (way == 1) spec.settings.integrator = Integrator::kPbgi;
+    if (way == 2) spec.settings.fill = Fill::kCut;
+    if (way == 3) spec.settings.integrator = Integrator::kPt;
+    JobSpec other = spec;
+    other.settings.no_skip = true;
+    const bool cuts = way == 1 || way == 2;
+    EXPECT_EQ(JobHash(spec) != JobHash(other), cuts) << way;
+    EXPECT_EQ(ImageSettingsJson(spec) != ImageSettingsJson(other), cuts) << way;
+  }
+}
+
 TEST(JobHash, HearsWhatChangesThePixels) {
   const JobSpec spec = SomeSpec();
   std::vector<JobSpec> others(8, spec);
