@@ -33,6 +33,8 @@ constexpr Known kKnown[] = {
     {"scale-powers-of-two", "fpbgi", "scale 2^-30: values whose bits differ", 2000},
     {"scale-powers-of-two", "pbgi", "scale 2^-30: values whose bits differ", 1000},
     {"scale-powers-of-two", "pt", "scale 2^-30: values whose bits differ", 2000},
+    // A record or two lies on the other side of a rounding.
+    {"scale-thousands", "fpbgi", "scale 0.001: rr", 0.005},
     // Sides that only someone inside a closed object sees are left out of the gather.
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: rr against pt", 2},
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: bias, without its sign", 1.3},
