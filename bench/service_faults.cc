@@ -73,9 +73,14 @@ absl::Status RunSchedules(const ServiceContext& context, ServiceResult& result) 
     const auto count = static_cast<size_t>(1 << below(4));
     job.tile = 32 << below(3);
     FP_RETURN_IF_ERROR(grow(count));
-    // Those beyond the schedule's number rest.
+    // Exactly the schedule's number. Those beyond it must not be stopped instead: the coordinator
+    // would give them the tiles that they wait for.
     for (size_t i = 0; i < farm->worker_count(); ++i) {
-      if (i >= count) farm->worker(i).Signal(SIGSTOP);
+      if (i >= count) {
+        farm->worker(i).Kill();
+      } else if (!farm->worker(i).Running()) {
+        FP_RETURN_IF_ERROR(farm->Restart(i));
+      }
     }
     FP_ASSIGN_OR_RETURN(const JobId id, farm->Submit(job));
     struct Later {
@@ -152,15 +157,14 @@ absl::Status RunSchedules(const ServiceContext& context, ServiceResult& result) 
       reissued += tries == 0 ? end.reissued : 0;
       if (end.state == JobState::kDone || tries == 3) break;
       ++requeued;
+      result.notes.push_back("schedule " + std::to_string(number) +
+                             " had to be requeued: " + std::string(end.error.message()));
       FP_RETURN_IF_ERROR(farm->client().Requeue(id, false));
     }
     FP_ASSIGN_OR_RETURN(const Digest hash, farm->ImageOf(id));
     hashes.insert(hash.Hex());
     FP_RETURN_IF_ERROR(CountCommits(*farm, id, lost, twice));
-    for (size_t i = 0; i < farm->worker_count(); ++i) {
-      farm->worker(i).Signal(SIGCONT);
-      if (!farm->worker(i).Running()) FP_RETURN_IF_ERROR(farm->Restart(i));
-    }
+    for (size_t i = 0; i < count; ++i) farm->worker(i).Signal(SIGCONT);
     if (number % 20 == 19) context.progress("schedules: " + std::to_string(number + 1));
   }
   Figure(result, "schedules", schedules);

@@ -389,14 +389,16 @@ class Crowd {
  private:
   void Work(int index) {
     const auto link = GrpcLink::Connect(address_);
-    const auto welcome = link->Register({.version = FARPOINT_VERSION,
-                                         .fingerprint = fingerprint_,
-                                         .threads = 1,
-                                         .name = "crowd " + std::to_string(index)});
-    if (!welcome.ok()) {
-      ++errors;
-      return;
+    absl::StatusOr<WorkerWelcome> welcome = absl::UnavailableError("not tried");
+    // Hundreds that connect at the same moment: some are late, and try again as workers do.
+    while (!stop_ && !welcome.ok()) {
+      welcome = link->Register({.version = FARPOINT_VERSION,
+                                .fingerprint = fingerprint_,
+                                .threads = 1,
+                                .name = "crowd " + std::to_string(index)});
+      if (!welcome.ok()) Sleep(100);
     }
+    if (!welcome.ok()) return;
     link->Attend(welcome->id);
     ++registered_;
     std::vector<double> leases, returns;

@@ -24,8 +24,7 @@ class Attendance final : public grpc::ServerWriteReactor<v1::AttendResponse> {
   Attendance(CoordinatorApi& coordinator, const WorkerId& worker)
       : coordinator_(coordinator), worker_(worker) {
     const absl::StatusOr<uint64_t> connection = coordinator_.Attached(worker_);
-    attached_ = connection.ok();
-    if (attached_) {
+    if (connection.ok()) {
       connection_ = *connection;
       StartSendInitialMetadata();
     } else {
@@ -33,7 +32,9 @@ class Attendance final : public grpc::ServerWriteReactor<v1::AttendResponse> {
     }
   }
   void OnCancel() override {
-    if (attached_) coordinator_.Detached(worker_, connection_);
+    if (const uint64_t connection = connection_; connection != 0) {
+      coordinator_.Detached(worker_, connection);
+    }
     End(grpc::Status::CANCELLED);
   }
   void OnDone() override { delete this; }
@@ -45,8 +46,7 @@ class Attendance final : public grpc::ServerWriteReactor<v1::AttendResponse> {
 
   CoordinatorApi& coordinator_;
   const WorkerId worker_;
-  bool attached_ = false;
-  uint64_t connection_ = 0;
+  std::atomic<uint64_t> connection_ = 0;  // 0: none
   std::atomic<bool> ended_ = false;
 };
 
