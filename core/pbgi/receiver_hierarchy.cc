@@ -407,8 +407,8 @@ bool ReceiverHierarchy::Pass::Cells(size_t l, const PixelRect& region) {
       }
       const ReceiverPlace& place = place_of(i);
       if (place.footprint_m < 0) continue;
-      cells[i] = CellOf(place.receiver, kCellSide * static_cast<float>(s) * place.footprint_m,
-                        hierarchy.params_.unit_m, seed);
+      cells[i] =
+          CellOf(place.receiver, kCellSide * static_cast<float>(s) * place.footprint_m, seed);
     }
   });
 
@@ -468,8 +468,7 @@ bool ReceiverHierarchy::Pass::Cells(size_t l, const PixelRect& region) {
         if (!item.record) continue;
         place.x_px = item.record->x_px;
         place.y_px = item.record->y_px;
-      } else if (!hierarchy.source_.ReceiverAlong(
-                     ProbeOf(item.cell, hierarchy.params_.unit_m, seed), place)) {
+      } else if (!hierarchy.source_.ReceiverAlong(ProbeOf(item.cell, seed), place)) {
         item.decided = true;
         continue;
       }
@@ -628,10 +627,8 @@ bool ReceiverHierarchy::Pass::Pixels(size_t l, const PixelRect& region) {
   for (Square& square : found) {
     // A pixel's record has the key of its place, too.
     for (const ReceiverPlace* place : square.chosen) {
-      made.push_back({*place,
-                      CellOf(place->receiver, place->footprint_m, hierarchy.params_.unit_m,
-                             hierarchy.params_.seed),
-                      nullptr});
+      made.push_back(
+          {*place, CellOf(place->receiver, place->footprint_m, hierarchy.params_.seed), nullptr});
     }
     for (auto& record : square.known) kept.push_back({{}, std::move(record)});
   }

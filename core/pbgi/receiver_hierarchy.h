@@ -66,7 +66,6 @@ struct HierarchyParams {
   // channels, and of openness; 0: any does.
   float spread_wm2 = 0;
   float spread_open = 0;
-  float unit_m = 1;  // of world cells, see CellOf
   uint64_t seed = 0;
 };
 

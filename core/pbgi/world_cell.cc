@@ -47,15 +47,15 @@ uint64_t HashOf(const WorldCell& cell, uint64_t seed) {
                  static_cast<uint64_t>(cell.layer), static_cast<uint64_t>(cell.face));
 }
 
-WorldCell CellOf(const Receiver& receiver, float side_m, float unit_m, uint64_t seed) {
-  const Vec3f p = receiver.position / unit_m;
+WorldCell CellOf(const Receiver& receiver, float side_m, uint64_t seed) {
+  const Vec3f& p = receiver.position;
   const Vec3f& n = receiver.geometric_normal;
   const float steep[3] = {std::fabs(n.x), std::fabs(n.y), std::fabs(n.z)};
   const int axis = static_cast<int>(std::max_element(steep, steep + 3) - steep);
   const int a = (axis + 1) % 3, b = (axis + 2) % 3;
   WorldCell cell;
   cell.face = static_cast<int16_t>(2 * axis + (n[axis] > 0.0f ? 1 : 0));
-  int exponent = FloorLog2(std::max(side_m / unit_m, std::numeric_limits<float>::min()));
+  int exponent = FloorLog2(std::max(side_m, std::numeric_limits<float>::min()));
   const float largest = std::max({std::fabs(p.x), std::fabs(p.y), std::fabs(p.z)});
   if (largest > 0.0f) exponent = std::max(exponent, FloorLog2(largest) - kDigits);
   cell.exponent = static_cast<int16_t>(exponent);
@@ -71,7 +71,7 @@ WorldCell CellOf(const Receiver& receiver, float side_m, float unit_m, uint64_t 
   return cell;
 }
 
-CellProbe ProbeOf(const WorldCell& cell, float unit_m, uint64_t seed) {
+CellProbe ProbeOf(const WorldCell& cell, uint64_t seed) {
   const int axis = cell.face / 2;
   const bool positive = cell.face % 2 != 0;
   float u, v;
@@ -79,12 +79,11 @@ CellProbe ProbeOf(const WorldCell& cell, float unit_m, uint64_t seed) {
   const float bottom = static_cast<float>(cell.layer) - kLayerOffset - kBeyond;
   const float length = 1 + 2 * kBeyond;
   CellProbe probe;
-  const auto in_metres = [&](float x) { return std::ldexp(x * unit_m, cell.exponent); };
-  probe.origin[(axis + 1) % 3] = in_metres(u);
-  probe.origin[(axis + 2) % 3] = in_metres(v);
-  probe.origin[axis] = in_metres(positive ? bottom + length : bottom);
+  probe.origin[(axis + 1) % 3] = std::ldexp(u, cell.exponent);
+  probe.origin[(axis + 2) % 3] = std::ldexp(v, cell.exponent);
+  probe.origin[axis] = std::ldexp(positive ? bottom + length : bottom, cell.exponent);
   probe.direction[axis] = positive ? -1.0f : 1.0f;
-  probe.length_m = in_metres(length);
+  probe.length_m = std::ldexp(length, cell.exponent);
   return probe;
 }
 

@@ -1,12 +1,12 @@
 // Cells of surface that are fixed in the scene: where a moving camera finds its gather records
 // again.
 //
-// A cell is a square of side h, a power of two of the scene's unit, in the coordinate plane that
-// the surface faces most (its `face`), within a layer of height h across it. Its place is the point
-// where a probe meets a surface first that crosses the layer (and a quarter of h more on either
-// side) at a point of the square's middle, jittered by the cell's own coordinates. So the place is
-// a function of the cell, the scene and the seed; a camera decides which cells are asked for, and
-// how large, and may refuse places that it does not see.
+// A cell is a square of side h, a power of two, in the coordinate plane that the surface faces most
+// (its `face`), within a layer of height h across it. Its place is the point where a probe meets a
+// surface first that crosses the layer (and a quarter of h more on either side) at a point of the
+// square's middle, jittered by the cell's own coordinates. So the place is a function of the cell,
+// the scene and the seed; a camera decides which cells are asked for, and how large, and may refuse
+// places that it does not see.
 #pragma once
 
 #include <compare>
@@ -19,7 +19,7 @@ namespace farpoint {
 
 struct WorldCell {
   int64_t i = 0, j = 0, layer = 0;
-  int16_t exponent = 0;  // h = 2^exponent units
+  int16_t exponent = 0;  // h = 2^exponent metres
   int16_t face = 0;      // 2 axis + (1: the surface faces the axis' positive end)
 
   auto operator<=>(const WorldCell&) const = default;
@@ -34,15 +34,14 @@ struct WorldCellHash {
 };
 
 // The cell of a receiver, h in (side_m / 2, side_m], or more where floats near the receiver are too
-// coarse for that. side_m > 0. `unit_m` in [1/2, 1]: a length of the scene over a power of two, so
-// that a scene that is modelled in another unit has the same cells.
-WorldCell CellOf(const Receiver& receiver, float side_m, float unit_m, uint64_t seed);
+// coarse for that. side_m > 0.
+WorldCell CellOf(const Receiver& receiver, float side_m, uint64_t seed);
 
 struct CellProbe {
   Vec3f origin, direction;  // unit
   float length_m;
 };
 
-CellProbe ProbeOf(const WorldCell& cell, float unit_m, uint64_t seed);
+CellProbe ProbeOf(const WorldCell& cell, uint64_t seed);
 
 }  // namespace farpoint

@@ -237,7 +237,6 @@ class Renderer final : public FrameRenderer {
       std::call_once(scaled_, [&] {
         const RecordGatherer::Means mean = gatherer_->MeanOf(frame_.film.frame(), executor);
         HierarchyParams params = HierarchyOf(settings_);
-        params.unit_m = scene_.unit_m;
         const bool draft = settings_.quality == Quality::kDraft;
         params.spread_wm2 = (draft ? kMostDraftSpread : kMostSpread) * mean.irradiance;
         const float noise = NoiseOf(settings_);
@@ -978,20 +977,6 @@ bool IsRotation(const Camera& c) {
          near(Dot(c.up, c.forward), 0);
 }
 
-float UnitOf(const PreparedScene& scene) {
-  std::vector<double> area_m2(scene.objects().size(), 0.0);
-  for (const PreparedTriangle& t : scene.triangles()) {
-    const Vec3d a(scene.vertices()[t.vertex[0]]);
-    const Vec3d u = Vec3d(scene.vertices()[t.vertex[1]]) - a;
-    const Vec3d v = Vec3d(scene.vertices()[t.vertex[2]]) - a;
-    area_m2[t.object] += 0.5 * Length(Cross(u, v));
-  }
-  double largest_m2 = 0;
-  for (const double area : area_m2) largest_m2 = std::max(largest_m2, area);
-  int exponent;
-  return largest_m2 > 0 ? static_cast<float>(std::frexp(std::sqrt(largest_m2), &exponent)) : 1.0f;
-}
-
 }  // namespace
 
 absl::StatusOr<std::shared_ptr<const LoadedScene>> LoadedScene::Load(const BakedScene& blobs,
@@ -1001,7 +986,6 @@ absl::StatusOr<std::shared_ptr<const LoadedScene>> LoadedScene::Load(const Baked
   FP_ASSIGN_OR_RETURN(loaded->scene, PreparedScene::FromBlob(blobs.prepared_scene));
   FP_ASSIGN_OR_RETURN(loaded->accel, RayAccel::Build(loaded->scene));
   loaded->lights = std::make_unique<LightSampler>(loaded->accel);
-  loaded->unit_m = UnitOf(*loaded->scene);
   if (blobs.tree_topology.size() != 0) {
     FP_ASSIGN_OR_RETURN(loaded->tree,
                         PointTree::FromBlobs(blobs.tree_topology, blobs.tree_radiance));

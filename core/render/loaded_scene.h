@@ -18,10 +18,6 @@ class LoadedSceneData final : public LoadedScene {
   std::shared_ptr<const RayAccel> accel;
   std::unique_ptr<const LightSampler> lights;
   std::shared_ptr<const PointTree> tree;  // null if the blobs have none
-  // The root of the largest object's area, over a power of two: in [1/2, 1]. What is rounded to
-  // powers of two of it is so alike in whatever unit of length a scene is modelled, and stays so
-  // when objects move.
-  float unit_m = 1;
 
   // Made when it is first asked for; `tree` must be there.
   const SurfelAtlas& Atlas() const {

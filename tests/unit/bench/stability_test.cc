@@ -33,8 +33,9 @@ constexpr Known kKnown[] = {
     {"scale-powers-of-two", "fpbgi", "scale 2^-30: values whose bits differ", 2000},
     {"scale-powers-of-two", "pbgi", "scale 2^-30: values whose bits differ", 1000},
     {"scale-powers-of-two", "pt", "scale 2^-30: values whose bits differ", 2000},
-    // A record or two lies on the other side of a rounding.
-    {"scale-thousands", "fpbgi", "scale 0.001: rr", 0.005},
+    // Records lie in cells of the world whose side is a power of two in metres.
+    {"scale-thousands", "fpbgi", "scale 0.001: rr", 0.06},
+    {"scale-thousands", "fpbgi", "scale 1000: rr", 0.06},
     // Sides that only someone inside a closed object sees are left out of the gather.
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: rr against pt", 2},
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: bias, without its sign", 1.3},

@@ -27,11 +27,11 @@ TEST(WorldCell, TheProbeMeetsTheReceiversPlaneInItsCell) {
     const Vec3f n = UniformSphere(U(i, 0), U(i, 1));
     const Vec3f p = Vec3f(U(i, 2), U(i, 3), U(i, 4)) * 20.0f - Vec3f(10);
     const float side = 0.01f + U(i, 5);
-    const WorldCell cell = CellOf(On(p, n), side, 1, 7);
+    const WorldCell cell = CellOf(On(p, n), side, 7);
     const float h = std::ldexp(1.0f, cell.exponent);
     EXPECT_LE(h, side);
     EXPECT_GT(h, 0.5f * side);
-    const CellProbe probe = ProbeOf(cell, 1, 7);
+    const CellProbe probe = ProbeOf(cell, 7);
     EXPECT_LT(Dot(probe.direction, n), -0.57f);
     EXPECT_NEAR(Length(probe.direction), 1, 1e-6);
     const float t = Dot(p - probe.origin, n) / Dot(probe.direction, n);
@@ -40,31 +40,9 @@ TEST(WorldCell, TheProbeMeetsTheReceiversPlaneInItsCell) {
     const Vec3f met = probe.origin + probe.direction * t;
     // A square's diagonal apart, on a plane that may be steep.
     EXPECT_LT(Length(met - p), 1.42f * 1.74f * h);
-    same += CellOf(On(met, n), side, 1, 7) == cell;
+    same += CellOf(On(met, n), side, 7) == cell;
   }
   EXPECT_GT(same, 2990u);
-}
-
-// A scene in another unit of length: the same cells, and places at the same points of it.
-TEST(WorldCell, AnotherUnitOfLengthIsTheSceneScaled) {
-  size_t same = 0;
-  for (uint64_t i = 0; i < 500; ++i) {
-    const Vec3f n = UniformSphere(U(i, 0), U(i, 1));
-    const Vec3f p = Vec3f(U(i, 2), U(i, 3), U(i, 4)) - Vec3f(0.5f);
-    constexpr float kUnit = 0.61f, kScale = 1000;
-    const WorldCell cell = CellOf(On(p, n), 0.05f, kUnit, 1);
-    int exponent;
-    const float unit = std::frexp(kUnit * kScale, &exponent);
-    const WorldCell scaled = CellOf(On(p * kScale, n), 0.05f * kScale, unit, 1);
-    EXPECT_EQ(scaled.exponent, cell.exponent + exponent);
-    if (scaled.i != cell.i || scaled.j != cell.j || scaled.layer != cell.layer) continue;
-    ++same;
-    const CellProbe a = ProbeOf(cell, kUnit, 1), b = ProbeOf(scaled, unit, 1);
-    EXPECT_EQ(a.direction, b.direction);
-    EXPECT_NEAR(b.length_m / kScale, a.length_m, 1e-6f * a.length_m);
-    EXPECT_LT(Length(b.origin / kScale - a.origin), 1e-6f);
-  }
-  EXPECT_GT(same, 490u);
 }
 
 // Scaling by a power of two changes no cell but its exponent.
@@ -72,9 +50,9 @@ TEST(WorldCell, ScalesByPowersOfTwo) {
   for (uint64_t i = 0; i < 500; ++i) {
     const Vec3f n = UniformSphere(U(i, 0), U(i, 1));
     const Vec3f p = Vec3f(U(i, 2), U(i, 3), U(i, 4)) - Vec3f(0.5f);
-    const WorldCell cell = CellOf(On(p, n), 0.05f, 1, 1);
+    const WorldCell cell = CellOf(On(p, n), 0.05f, 1);
     for (const int e : {-30, 3, 40}) {
-      WorldCell scaled = CellOf(On(p * std::ldexp(1.0f, e), n), std::ldexp(0.05f, e), 1, 1);
+      WorldCell scaled = CellOf(On(p * std::ldexp(1.0f, e), n), std::ldexp(0.05f, e), 1);
       EXPECT_EQ(scaled.exponent, cell.exponent + e);
       scaled.exponent = cell.exponent;
       EXPECT_EQ(scaled, cell);
@@ -83,12 +61,12 @@ TEST(WorldCell, ScalesByPowersOfTwo) {
 }
 
 TEST(WorldCell, SidesOfASheetAndSeedsDiffer) {
-  const WorldCell up = CellOf(On({0.3f, 0.2f, 0}, {0, 0, 1}), 0.1f, 1, 1);
-  const WorldCell down = CellOf(On({0.3f, 0.2f, 0}, {0, 0, -1}), 0.1f, 1, 1);
+  const WorldCell up = CellOf(On({0.3f, 0.2f, 0}, {0, 0, 1}), 0.1f, 1);
+  const WorldCell down = CellOf(On({0.3f, 0.2f, 0}, {0, 0, -1}), 0.1f, 1);
   EXPECT_NE(up, down);
-  EXPECT_GT(ProbeOf(up, 1, 1).origin.z, 0);
-  EXPECT_LT(ProbeOf(down, 1, 1).origin.z, 0);
-  EXPECT_NE(ProbeOf(up, 1, 1).origin.x, ProbeOf(up, 1, 2).origin.x);
+  EXPECT_GT(ProbeOf(up, 1).origin.z, 0);
+  EXPECT_LT(ProbeOf(down, 1).origin.z, 0);
+  EXPECT_NE(ProbeOf(up, 1).origin.x, ProbeOf(up, 2).origin.x);
   std::set<uint64_t> hashes;
   for (int64_t i = -20; i < 20; ++i) {
     for (int64_t j = -20; j < 20; ++j) hashes.insert(HashOf({i, j, i - j, -3, 2}, 9));
@@ -99,13 +77,13 @@ TEST(WorldCell, SidesOfASheetAndSeedsDiffer) {
 // Far from the origin and close to the eye a cell is no finer than floats are.
 TEST(WorldCell, IsNoFinerThanFloats) {
   const Receiver far = On({1e6f, -3e5f, 2e4f}, {0, 1, 0});
-  const WorldCell cell = CellOf(far, 1e-20f, 1, 1);
+  const WorldCell cell = CellOf(far, 1e-20f, 1);
   EXPECT_GE(std::ldexp(1.0f, cell.exponent), 1e6f / (1 << 20));
-  const CellProbe probe = ProbeOf(cell, 1, 1);
+  const CellProbe probe = ProbeOf(cell, 1);
   EXPECT_LT(Length(probe.origin - far.position), 3 * std::ldexp(1.0f, cell.exponent));
   // On the origin itself, seen from there.
-  const WorldCell none = CellOf(On({0, 0, 0}, {1, 0, 0}), 0, 1, 1);
-  EXPECT_TRUE(std::isfinite(ProbeOf(none, 1, 1).length_m));
+  const WorldCell none = CellOf(On({0, 0, 0}, {1, 0, 0}), 0, 1);
+  EXPECT_TRUE(std::isfinite(ProbeOf(none, 1).length_m));
 }
 
 }  // namespace
