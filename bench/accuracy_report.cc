@@ -8,6 +8,7 @@
 
 #include "absl/strings/str_format.h"
 #include "bench/html_page.h"
+#include "bench/machine.h"
 #include "bench/text.h"
 
 namespace farpoint {
@@ -31,8 +32,7 @@ std::string SettingsText(const AccuracyOptions& o) {
 }
 
 std::string MachineText(const AccuracyReport& r) {
-  return absl::StrFormat("%s, %d threads, load %.1f at the start and %.1f at the end", r.cpu,
-                         r.threads, r.load_average_start, r.load_average_end);
+  return ::farpoint::MachineText(r.cpu, r.threads, r.load_average_start, r.load_average_end);
 }
 
 const Row kHeader = {"case",      "size",     "rr",          "± pixels",      "bar",

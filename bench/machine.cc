@@ -4,6 +4,8 @@
 #include <ctime>
 #include <fstream>
 
+#include "absl/strings/str_format.h"
+
 namespace farpoint {
 
 std::string CpuModel() {
@@ -19,6 +21,12 @@ std::string CpuModel() {
 double LoadAverage() {
   double load = 0;
   return getloadavg(&load, 1) == 1 ? load : 0.0;
+}
+
+std::string MachineText(std::string_view cpu, unsigned threads, double load_start,
+                        double load_end) {
+  return absl::StrFormat("%s, %d thread%s, load %.1f at the start and %.1f at the end", cpu,
+                         threads, threads == 1 ? "" : "s", load_start, load_end);
 }
 
 std::string DateUtc() {

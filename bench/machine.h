@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <string_view>
 
 namespace farpoint {
 
@@ -9,6 +10,8 @@ namespace farpoint {
 std::string CpuModel();
 // Over the last minute: processes that run or wait for a processor; 0 if it is not known.
 double LoadAverage();
+// "CPU, 2 threads, load 0.1 at the start and 2.0 at the end".
+std::string MachineText(std::string_view cpu, unsigned threads, double load_start, double load_end);
 // Now, as 2013-07-15T12:00:00Z.
 std::string DateUtc();
 

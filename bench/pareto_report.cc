@@ -11,6 +11,7 @@
 #include "absl/strings/str_format.h"
 #include "bench/accuracy_frame.h"
 #include "bench/html_page.h"
+#include "bench/machine.h"
 #include "bench/svg_plot.h"
 #include "bench/text.h"
 
@@ -139,8 +140,8 @@ std::string FilmText(const ParetoReport& r) {
 }
 
 std::string MachineText(const ParetoReport& r) {
-  return absl::StrFormat("%s, %d threads, load %.1f at the start and %.1f at the end", r.cpu,
-                         r.options.threads, r.load_average_start, r.load_average_end);
+  return ::farpoint::MachineText(r.cpu, r.options.threads, r.load_average_start,
+                                 r.load_average_end);
 }
 
 std::string SpreadText(const Spread& s) {

@@ -9,6 +9,7 @@
 
 #include "absl/strings/str_format.h"
 #include "bench/html_page.h"
+#include "bench/machine.h"
 #include "bench/svg_plot.h"
 #include "bench/text.h"
 
@@ -27,8 +28,8 @@ constexpr std::array kFrameStageList = {Stage::kPrimary, Stage::kCluster,   Stag
 const char* NameOf(Stage stage) { return kStageNames[static_cast<size_t>(stage)]; }
 
 std::string MachineText(const ScaleReport& r) {
-  return absl::StrFormat("%s, %d threads, load %.1f at the start and %.1f at the end", r.cpu,
-                         r.options.threads, r.load_average_start, r.load_average_end);
+  return ::farpoint::MachineText(r.cpu, r.options.threads, r.load_average_start,
+                                 r.load_average_end);
 }
 
 std::string SettingsText(const ScaleOptions& o) {

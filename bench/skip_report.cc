@@ -6,6 +6,7 @@
 
 #include "absl/strings/str_format.h"
 #include "bench/html_page.h"
+#include "bench/machine.h"
 #include "bench/text.h"
 
 namespace farpoint {
@@ -15,8 +16,7 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 std::string MachineText(const SkipReport& r) {
-  return absl::StrFormat("%s, %d thread(s), load %.1f at the start and %.1f at the end", r.cpu,
-                         r.threads, r.load_average_start, r.load_average_end);
+  return ::farpoint::MachineText(r.cpu, r.threads, r.load_average_start, r.load_average_end);
 }
 
 std::string SettingsText(const SkipOptions& o) {

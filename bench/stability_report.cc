@@ -10,6 +10,7 @@
 
 #include "absl/strings/str_format.h"
 #include "bench/html_page.h"
+#include "bench/machine.h"
 #include "bench/text.h"
 
 namespace farpoint {
@@ -21,8 +22,7 @@ using Json = nlohmann::ordered_json;
 constexpr const char* kIntegrators[] = {"fpbgi", "pbgi", "pt", "scene"};
 
 std::string MachineText(const StabilityReport& r) {
-  return absl::StrFormat("%s, %d threads, load %.1f at the start and %.1f at the end", r.cpu,
-                         r.threads, r.load_average_start, r.load_average_end);
+  return ::farpoint::MachineText(r.cpu, r.threads, r.load_average_start, r.load_average_end);
 }
 
 std::string SettingsText(const StabilityOptions& o) {

@@ -41,19 +41,9 @@ ClosedPixels::ClosedPixels(const MicrobufferMap& map)
   const int n = side_;
   for (int row = -kLargest; row < n + kLargest; ++row) {
     for (int column = -kLargest; column < n + kLargest; ++column) {
-      int i = column, j = row;
-      if (i >= 0 && i < n && j >= 0 && j < n) continue;
-      // Beyond a border the map is its own copy, turned by 180° about the border's middle.
-      if (i < 0 || i >= n) {
-        i = i < 0 ? -1 - i : 2 * n - 1 - i;
-        j = n - 1 - j;
-      }
-      if (j < 0 || j >= n) {
-        j = j < 0 ? -1 - j : 2 * n - 1 - j;
-        i = n - 1 - i;
-      }
+      if (column >= 0 && column < n && row >= 0 && row < n) continue;
       border_.push_back(static_cast<uint32_t>((row + kLargest) * stride_ + column + kLargest));
-      source_.push_back(static_cast<uint32_t>(j * n + i));
+      source_.push_back(static_cast<uint32_t>(map.Wrap(column, row)));
     }
   }
 }

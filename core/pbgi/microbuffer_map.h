@@ -45,8 +45,9 @@ class MicrobufferMap {
   Vec2f Project(const Vec3f& w) const;
   // The unit direction of the point (u, v).
   Vec3f Unproject(float u, float v) const;
-  // The pixel at column i, row j, each in [-1, side]: across the border of the octahedral map the
-  // neighbour on the sphere; -1 outside the cosine map (below the horizon).
+  // The pixel at column i, row j, each in [-side, 2 side): beyond a border the octahedral map is
+  // its own copy, turned by 180° about the border's middle, so that neighbours are those on the
+  // sphere; -1 outside the cosine map (below the horizon).
   int32_t Wrap(int i, int j) const {
     const int n = static_cast<int>(side_);
     if (static_cast<unsigned>(i) < side_ && static_cast<unsigned>(j) < side_) return j * n + i;
