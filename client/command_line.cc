@@ -374,6 +374,14 @@ void DeclareCoordinator(Options& options, CommandLine& line, Parsed& parsed) {
   DeclareSecurity(options, line);
 }
 
+void DeclareDisplay(Options& options, CommandLine& line) {
+  options.Text(
+      "--display-server", "HOST:PORT", line.display_server,
+      "show tiles as they come in a viewer that speaks tev's protocol, as tev does on port "
+      "14158",
+      "Output");
+}
+
 void DeclareImage(Options& options, CommandLine& line, Parsed& parsed) {
   options.Text("-o,--output", "OUT.exr", line.output,
                "the image to write; out.####.exr or out.%04d.exr for a sequence", "Output");
@@ -384,6 +392,7 @@ void DeclareImage(Options& options, CommandLine& line, Parsed& parsed) {
   options.Number<double>("--exposure", "STOPS", parsed.exposure, -64, 64,
                          "exposure of the preview; default 0", "Output");
   options.Text("--json", "FILE", line.json, "statistics; - for stdout", "Output");
+  DeclareDisplay(options, line);
 }
 
 // What every command has that asks a coordinator.
@@ -424,6 +433,7 @@ void Declare(Options& options, CommandLine& line, Parsed& parsed) {
     case Verb::kWatch:
       options.Positionals("JOB", line.jobs, "ids of jobs; default: all that have not ended");
       DeclareFarm(options, line, parsed, "how the jobs ended, as JSON; - for stdout");
+      DeclareDisplay(options, line);
       break;
     case Verb::kPause:
     case Verb::kResume:
@@ -583,10 +593,8 @@ absl::Status Split(Options& options, std::span<const std::string> args) {
   return options.Check();
 }
 
-absl::Status CheckCoordinator(const std::string& address) {
-  if (address.empty()) {
-    return Bad("--coordinator: not given; say HOST:PORT or set FARPOINT_COORDINATOR");
-  }
+absl::Status CheckAddress(const std::string& flag, const std::string& address,
+                          const std::string& example) {
   const size_t colon = address.rfind(':');
   int port = 0;
   const char* end = address.data() + address.size();
@@ -602,9 +610,27 @@ absl::Status CheckCoordinator(const std::string& address) {
            (bracketed && (c == ':' || c == '[' || c == ']' || c == '%'));
   });
   if (!has_port || !good_host) {
-    return Bad("--coordinator " + address + ": expected HOST:PORT, e.g. farm.example:7447");
+    return Bad(flag + " " + address + ": expected HOST:PORT, e.g. " + example);
   }
   return absl::OkStatus();
+}
+
+absl::Status CheckCoordinator(const std::string& address) {
+  if (address.empty()) {
+    return Bad("--coordinator: not given; say HOST:PORT or set FARPOINT_COORDINATOR");
+  }
+  return CheckAddress("--coordinator", address, "farm.example:7447");
+}
+
+absl::Status CheckDisplay(const CommandLine& line) {
+  if (line.display_server.empty()) return absl::OkStatus();
+  if (line.detach) {
+    return Bad("--display-server: with --detach no tile arrives here; leave one of both out");
+  }
+  if (line.verb == Verb::kWatch && line.jobs.size() != 1) {
+    return Bad("--display-server: shows one job; name it");
+  }
+  return CheckAddress("--display-server", line.display_server, "127.0.0.1:14158");
 }
 
 absl::Status CheckJobs(const CommandLine& line) {
@@ -693,6 +719,7 @@ absl::Status CheckNeeds(const CommandLine& line) {
     return Bad("--partial: takes what is there now; leave --wait out");
   }
   FP_RETURN_IF_ERROR(CheckJobs(line));
+  FP_RETURN_IF_ERROR(CheckDisplay(line));
   if (line.verb != Verb::kRender && line.verb != Verb::kCompare) {
     FP_RETURN_IF_ERROR(CheckCoordinator(line.coordinator));
   }

@@ -72,6 +72,9 @@ struct CommandLine {
   float exposure_stops = 0;
   ExrCompression compression = ExrCompression::kZip;
 
+  // render, submit, fetch, watch of one job
+  std::string display_server;  // HOST:PORT of a viewer; empty: none
+
   // fetch
   std::vector<int32_t> frames;  // empty: all
   bool partial = false;

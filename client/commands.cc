@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "client/certs.h"
+#include "client/display_server.h"
 #include "client/doctor.h"
 #include "client/embedded_farm.h"
 #include "client/exit_code.h"
@@ -108,11 +109,40 @@ absl::StatusOr<ImageWriter> MakeWriter(const CommandLine& line, Console& console
                              std::chrono::steady_clock::now(), console);
 }
 
-FrameSink SinkOf(ImageWriter& writer) {
-  return [&writer](const JobInfo& info, const FetchedFrame& frame) {
-    return writer.Write(info, frame);
-  };
-}
+// Writes frames, and shows them and their tiles to the viewer of --display-server, if there is one.
+class ImageOutput {
+ public:
+  // `writer` must outlive this. For jobs that `run` waits for or fetches.
+  ImageOutput(const CommandLine& line, ImageWriter& writer, JobRun& run, Console& console)
+      : writer_(writer) {
+    if (line.display_server.empty()) return;
+    display_ = std::make_unique<DisplayServer>(
+        DisplayOptions{.address = line.display_server,
+                       .name = [&writer](const JobInfo& info,
+                                         uint32_t frame) { return writer.NameOf(info, frame); },
+                       .warn = [&console](const std::string& text) { console.Warn(text); }});
+    run.ShowTiles([this](const JobInfo& info, uint32_t tile, const Film& film) {
+      display_->ShowTile(info, tile, film);
+    });
+  }
+
+  FrameSink Sink() {
+    return [this](const JobInfo& info, FetchedFrame frame) {
+      FP_RETURN_IF_ERROR(writer_.Write(info, frame));
+      if (display_ != nullptr) display_->ShowFrame(info, frame.frame, std::move(frame.film));
+      return absl::OkStatus();
+    };
+  }
+
+  // After all is written.
+  void Finish() {
+    if (display_ != nullptr) display_->Finish();
+  }
+
+ private:
+  ImageWriter& writer_;
+  std::unique_ptr<DisplayServer> display_;
+};
 
 // The numbers of the frames that are not written, as --frames takes them.
 std::string FramesLeft(const JobSpec& spec, const ImageWriter& writer) {
@@ -162,8 +192,9 @@ absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& cons
   // Nothing is between this and the coordinator: one attempt says all.
   Retry once({.patience = std::chrono::milliseconds(0)}, "the embedded coordinator", stop, console);
   JobRun run(*farm, once, stop, console);
+  ImageOutput output(line, writer, run, console);
   FP_ASSIGN_OR_RETURN(const JobId id, run.Submit(request));
-  const absl::Status outcome = run.Wait(id, SinkOf(writer));
+  const absl::Status outcome = run.Wait(id, output.Sink());
   if (stop.raised()) {
     farm->Cancel(id).IgnoreError();
     if (!writer.written().empty()) {
@@ -172,6 +203,7 @@ absl::Status Render(const CommandLine& line, const StopFlag& stop, Console& cons
     }
   }
   FP_RETURN_IF_ERROR(outcome);
+  output.Finish();
   return writer.WriteStatistics();
 }
 
@@ -215,7 +247,8 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
     return line.json == "-" ? absl::OkStatus() : WriteText("-", id.value + "\n");
   }
   console.Info("job " + id.value);
-  const absl::Status outcome = run.Wait(id, SinkOf(writer));
+  ImageOutput output(line, writer, run, console);
+  const absl::Status outcome = run.Wait(id, output.Sink());
   if (stop.raised()) {
     std::string command = FetchCommand(line, id);
     if (!writer.written().empty()) command += " --frames " + FramesLeft(spec, writer);
@@ -223,6 +256,7 @@ absl::Status Submit(const CommandLine& line, const StopFlag& stop, Console& cons
                  " gets what is left, farpoint cancel " + id.value + " ends it");
   }
   FP_RETURN_IF_ERROR(outcome);
+  output.Finish();
   return writer.WriteStatistics();
 }
 
@@ -261,6 +295,7 @@ absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& conso
                       OpenFarm(line, stop, console, usage_error));
   Retry retry = MakeRetry(line, stop, console);
   JobRun run(*farm, retry, stop, console);
+  ImageOutput output(line, writer, run, console);
   const JobId id{line.jobs[0]};
   FP_ASSIGN_OR_RETURN(JobInfo info, run.Info(id));
   usage_error = true;
@@ -271,15 +306,17 @@ absl::Status Fetch(const CommandLine& line, const StopFlag& stop, Console& conso
   if (line.wait && !IsFinal(info.status.state)) {
     // Frame by frame if all are wanted, else together at the end.
     const bool all = line.frames.empty();
-    const absl::Status outcome = run.Wait(id, all ? SinkOf(writer) : FrameSink());
+    const absl::Status outcome = run.Wait(id, all ? output.Sink() : FrameSink());
     if (stop.raised()) return outcome;
     if (all) {
       FP_RETURN_IF_ERROR(outcome);
+      output.Finish();
       return writer.WriteStatistics();
     }
     FP_ASSIGN_OR_RETURN(info, run.Info(id));
   }
-  FP_ASSIGN_OR_RETURN(const size_t fetched, run.Fetch(info, wanted, line.partial, SinkOf(writer)));
+  FP_ASSIGN_OR_RETURN(const size_t fetched, run.Fetch(info, wanted, line.partial, output.Sink()));
+  output.Finish();
   if (fetched > 0) FP_RETURN_IF_ERROR(writer.WriteStatistics());
   const auto whole =
       std::count_if(writer.written().begin(), writer.written().end(),

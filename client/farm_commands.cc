@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "client/display_server.h"
 #include "client/exit_code.h"
 #include "client/image_writer.h"
 #include "client/job_run.h"
@@ -103,6 +104,31 @@ class LineOutput {
   std::unique_ptr<std::FILE, void (*)(std::FILE*)> stream_;
   bool closed_ = false;
 };
+
+// "a1b2c3d4" or its title, and the frame's number.
+std::string ImageName(const JobInfo& info, uint32_t frame) {
+  std::string name = info.spec.title.empty() ? info.status.id.value : info.spec.title;
+  if (!info.spec.frames.empty()) name += " " + std::to_string(info.frames[frame].number);
+  std::replace(name.begin(), name.end(), '\0', ' ');
+  return name;
+}
+
+absl::Status WatchOne(FarmSession& session, const JobId& job) {
+  JobRun run(session.farm, session.retry, session.stop, session.console);
+  if (session.line.display_server.empty()) return run.Wait(job);
+  DisplayServer display({.address = session.line.display_server,
+                         .name = ImageName,
+                         .warn = [&](const std::string& text) { session.console.Warn(text); }});
+  run.ShowTiles([&](const JobInfo& info, uint32_t tile, const Film& film) {
+    display.ShowTile(info, tile, film);
+  });
+  const absl::Status outcome = run.Wait(job, [&](const JobInfo& info, FetchedFrame frame) {
+    display.ShowFrame(info, frame.frame, std::move(frame.film));
+    return absl::OkStatus();
+  });
+  if (outcome.ok()) display.Finish();
+  return outcome;
+}
 
 // Several jobs at once, by asking again and again.
 absl::StatusOr<std::vector<JobStatus>> WatchSeveral(FarmSession& session, std::set<JobId> jobs) {
@@ -209,8 +235,7 @@ absl::Status RunWatch(FarmSession session) {
   }
   if (jobs.size() == 1) {
     const JobId& job = *jobs.begin();
-    JobRun run(session.farm, session.retry, session.stop, session.console);
-    const absl::Status outcome = run.Wait(job);
+    const absl::Status outcome = WatchOne(session, job);
     if (session.stop.raised()) return outcome;
     // A coordinator that was lost, or an id that it does not know, has no status to write either.
     const auto status = StatusOf(session, job);

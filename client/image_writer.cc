@@ -98,6 +98,12 @@ absl::Status ImageWriter::Write(const JobInfo& info, const FetchedFrame& frame) 
   return absl::OkStatus();
 }
 
+std::string ImageWriter::NameOf(const JobInfo& info, uint32_t frame) const {
+  const std::string file =
+      info.spec.frames.empty() ? options_.exr : exr_path_.For(info.frames[frame].number);
+  return file.substr(file.rfind('/') + 1);
+}
+
 absl::Status ImageWriter::WriteStatistics() const {
   if (options_.json.empty()) return absl::OkStatus();
   Stats stats = stats_;

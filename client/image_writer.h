@@ -41,6 +41,9 @@ class ImageWriter {
   // One frame's files. Each is whole or absent.
   absl::Status Write(const JobInfo& info, const FetchedFrame& frame);
 
+  // What a viewer shows a frame as: the name of its file, without folders. `frame` is an index.
+  std::string NameOf(const JobInfo& info, uint32_t frame) const;
+
   // The --json file, of all frames that were written.
   absl::Status WriteStatistics() const;
 

@@ -22,6 +22,11 @@ constexpr int kFetchRounds = 4;
 constexpr int kInfoPause = 10;
 constexpr std::chrono::seconds kLongestPause(10);
 
+// Between two looks at what there is to show.
+constexpr std::chrono::milliseconds kShowPause(100);
+// Tiles that were shown and wait for their frame; what is beyond is fetched a second time.
+constexpr size_t kMaxEarlyBytes = size_t{256} << 20;
+
 using SteadyTime = std::chrono::steady_clock::time_point;
 
 std::string RandomId() {
@@ -105,26 +110,38 @@ absl::Status JobRun::Wait(const JobId& job, const FrameSink& sink) {
   std::vector<bool> taken;
   size_t taken_count = 0;
   SteadyTime next_take = SteadyTime::min();
+  std::map<uint32_t, Digest> to_show;
+  SteadyTime next_show = SteadyTime::min();
   while (true) {
-    bool take = false;
+    bool take = false, show = false;
     const absl::Status watched = retry_.Run([&] {
-      take = false;
+      take = show = false;
       return link_.Watch(job, last_sequence, [&](const JobEvent& event) -> absl::Status {
         retry_.Succeeded();
         if (event.sequence > 0) last_sequence = event.sequence;
         last = event.status;
         if (const auto* note = std::get_if<std::string>(&event.body)) console_.Info(*note);
         console_.Progress(event.status);
+        const auto* tile = std::get_if<TileCommitted>(&event.body);
+        if (tile != nullptr && tile_sink_ != nullptr) to_show[tile->tile] = tile->sha256;
+        const SteadyTime now = std::chrono::steady_clock::now();
+        show = !to_show.empty() && !IsFinal(last.state) && now >= next_show;
         // The last frame's tiles are fetched when the job has ended.
         take = sink != nullptr && !IsFinal(last.state) && last.frames.done > taken_count &&
-               std::chrono::steady_clock::now() >= next_take;
-        return take ? absl::AbortedError("frames are to be fetched") : absl::OkStatus();
+               now >= next_take;
+        return take || show ? absl::AbortedError("tiles are to be fetched") : absl::OkStatus();
       });
     });
-    if (!take) {
+    if (!take && !show) {
       FP_RETURN_IF_ERROR(watched);
       break;
     }
+    if (show) {
+      ShowEarly(job, to_show);
+      to_show.clear();
+      next_show = std::chrono::steady_clock::now() + kShowPause;
+    }
+    if (!take) continue;
     const SteadyTime start = std::chrono::steady_clock::now();
     FP_ASSIGN_OR_RETURN(const JobInfo info, Info(job));
     next_take = std::chrono::steady_clock::now();
@@ -146,6 +163,40 @@ absl::Status JobRun::Wait(const JobId& job, const FrameSink& sink) {
     FP_RETURN_IF_ERROR(TakeComplete(info, taken, sink));
   }
   return OutcomeOf(last);
+}
+
+void JobRun::ShowEarly(const JobId& job, const std::map<uint32_t, Digest>& tiles) {
+  if (!shown_job_ || shown_job_->status.id != job ||
+      tiles.rbegin()->first >= shown_job_->tiles.size()) {
+    absl::StatusOr<JobInfo> info = link_.Info(job);
+    if (!info.ok()) return;  // the frame's tiles are shown when it is fetched
+    shown_job_ = *std::move(info);
+  }
+  const Film sorted({}, shown_job_->spec.settings.layers);
+  std::vector<uint32_t> wanted;
+  for (const auto& [tile, sha256] : tiles) {
+    if (tile < shown_job_->tiles.size()) wanted.push_back(tile);
+  }
+  for (size_t first = 0; first < wanted.size(); first += kTilesPerCall) {
+    const auto some =
+        std::span(wanted).subspan(first, std::min(kTilesPerCall, wanted.size() - first));
+    const absl::Status fetched = link_.FetchTiles(job, some, [&](TileData data) -> absl::Status {
+      const auto asked = tiles.find(data.tile);
+      if (asked == tiles.end()) return absl::OkStatus();
+      TileInfo expected = shown_job_->tiles[data.tile];
+      expected.sha256 = asked->second;
+      const absl::StatusOr<Film> film = OpenTile(data, expected, sorted.layers());
+      if (!film.ok()) return absl::OkStatus();  // as above, and then it is told
+      tile_sink_(*shown_job_, data.tile, *film);
+      const size_t size = data.bytes.size();
+      if (early_bytes_ + size <= kMaxEarlyBytes &&
+          early_.try_emplace(data.tile, std::move(data)).second) {
+        early_bytes_ += size;
+      }
+      return absl::OkStatus();
+    });
+    if (!fetched.ok()) return;
+  }
 }
 
 absl::StatusOr<JobInfo> JobRun::Info(const JobId& job) {
@@ -179,6 +230,14 @@ absl::Status JobRun::FetchFrame(const JobInfo& info, uint32_t frame, bool partia
                                 const FrameSink& sink) {
   const JobId& job = info.status.id;
   FP_ASSIGN_OR_RETURN(Stitcher stitcher, Stitcher::Create(info, frame, partial));
+  for (const uint32_t tile : stitcher.Missing()) {
+    const auto early = early_.find(tile);
+    if (early == early_.end()) continue;
+    // One that a requeue has made worthless is fetched again.
+    stitcher.Add(early->second).IgnoreError();
+    early_bytes_ -= early->second.bytes.size();
+    early_.erase(early);
+  }
   for (int round = 0; round < kFetchRounds; ++round) {
     const std::vector<uint32_t> missing = stitcher.Missing();
     if (missing.empty()) break;
@@ -196,6 +255,7 @@ absl::Status JobRun::FetchFrame(const JobInfo& info, uint32_t frame, bool partia
             return absl::OkStatus();
           }
           retry_.Succeeded();
+          if (tile_sink_ != nullptr) tile_sink_(info, tile.tile, stitcher.film());
           std::erase(wanted, tile.tile);  // not asked for again if this call breaks
           return absl::OkStatus();
         });

@@ -3,8 +3,11 @@
 #pragma once
 
 #include <functional>
+#include <map>
+#include <optional>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "client/console.h"
@@ -26,11 +29,19 @@ struct FetchedFrame {
 // An error ends the call and is returned.
 using FrameSink = std::function<absl::Status(const JobInfo& info, FetchedFrame frame)>;
 
+// Takes a tile of info.tiles that is committed; `film` holds at least its pixels, checked as those
+// of a frame. Must not wait for anything.
+using TileSink = std::function<void(const JobInfo& info, uint32_t tile, const Film& film)>;
+
 // Not thread-safe. The references must outlive this.
 class JobRun {
  public:
   JobRun(FarmLink& link, Retry& retry, const StopFlag& stop, Console& console)
       : link_(link), retry_(retry), stop_(stop), console_(console) {}
+
+  // From here on, tiles go to `sink` as soon as they are known to be committed (Wait) or have
+  // arrived (Fetch), maybe more than once. That a tile cannot be had yet is no error of Wait.
+  void ShowTiles(TileSink sink) { tile_sink_ = std::move(sink); }
 
   // Sends the blobs that the coordinator lacks, then the job. Survives a coordinator that comes
   // back: the job is made once.
@@ -54,10 +65,17 @@ class JobRun {
   // Hands on the frames that are complete and not marked in `taken` yet, and marks them.
   absl::Status TakeComplete(const JobInfo& info, std::vector<bool>& taken, const FrameSink& sink);
 
+  // Fetches `tiles` for the tile sink, and keeps them for FetchFrame as far as there is room.
+  void ShowEarly(const JobId& job, const std::map<uint32_t, Digest>& tiles);
+
   FarmLink& link_;
   Retry& retry_;
   const StopFlag& stop_;
   Console& console_;
+  TileSink tile_sink_;
+  std::optional<JobInfo> shown_job_;    // what ShowEarly knows of the tiles
+  std::map<uint32_t, TileData> early_;  // shown, and not part of a frame yet
+  size_t early_bytes_ = 0;
 };
 
 // The state of a job as a status: OK if it is done, kUnavailable if it has not ended.

@@ -89,16 +89,9 @@ absl::StatusOr<Stitcher> Stitcher::Create(const JobInfo& info, uint32_t frame, b
   return Stitcher(first, {tiles.begin(), tiles.end()}, Film(crop, info.spec.settings.layers));
 }
 
-absl::Status Stitcher::Add(const TileData& tile) {
+absl::StatusOr<Film> OpenTile(const TileData& tile, const TileInfo& expected,
+                              std::span<const Layer> layers) {
   const std::string name = "tile " + std::to_string(tile.tile);
-  // Wraps around for a smaller number.
-  const uint32_t index = tile.tile - first_tile_;
-  if (index >= tiles_.size()) {
-    return absl::DataLossError(name + " is not one of the frame's " +
-                               std::to_string(tiles_.size()) + " tiles");
-  }
-  if (have_[index]) return absl::OkStatus();
-  const TileInfo& expected = tiles_[index];
   const Digest actual = tile.bytes.Hash();
   if (actual != expected.sha256) {
     return absl::DataLossError(name + " arrived damaged: its SHA-256 is " + actual.Hex() +
@@ -110,11 +103,23 @@ absl::Status Stitcher::Add(const TileData& tile) {
     return absl::DataLossError(name + " has the pixels " + RectText(film->rect()) +
                                ", announced were " + RectText(expected.rect));
   }
-  if (!std::equal(film->layers().begin(), film->layers().end(), film_.layers().begin(),
-                  film_.layers().end())) {
+  if (!std::equal(film->layers().begin(), film->layers().end(), layers.begin(), layers.end())) {
     return absl::DataLossError(name + " has other layers than the job");
   }
-  film_.Paste(*film);
+  return film;
+}
+
+absl::Status Stitcher::Add(const TileData& tile) {
+  const std::string name = "tile " + std::to_string(tile.tile);
+  // Wraps around for a smaller number.
+  const uint32_t index = tile.tile - first_tile_;
+  if (index >= tiles_.size()) {
+    return absl::DataLossError(name + " is not one of the frame's " +
+                               std::to_string(tiles_.size()) + " tiles");
+  }
+  if (have_[index]) return absl::OkStatus();
+  FP_ASSIGN_OR_RETURN(const Film film, OpenTile(tile, tiles_[index], film_.layers()));
+  film_.Paste(film);
   have_[index] = true;
   return absl::OkStatus();
 }

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -19,6 +20,11 @@ struct FrameTiles {
 };
 // `frame` is an index into info.frames.
 FrameTiles TilesOfFrame(const JobInfo& info, uint32_t frame);
+
+// The pixels of `tile`, if hash, rectangle and layers are what `expected` and `layers` (sorted, as
+// a film's) announce; else kDataLoss names the tile and what is wrong with it.
+absl::StatusOr<Film> OpenTile(const TileData& tile, const TileInfo& expected,
+                              std::span<const Layer> layers);
 
 class Stitcher {
  public:

@@ -92,6 +92,25 @@ TEST(CommandLine, Submit) {
                   .farm_ignores);
 }
 
+TEST(CommandLine, AViewerIsShownWhatArrivesHere) {
+  for (const std::vector<std::string>& args :
+       {std::vector<std::string>{"render", "a.glb", "-o", "o.exr"},
+        {"submit", "a.glb", "-o", "o.exr", "--coordinator", "h:1"},
+        {"fetch", "1", "-o", "o.exr", "--coordinator", "h:1"},
+        {"watch", "1", "--coordinator", "h:1"}}) {
+    std::vector<std::string> with = args;
+    with.insert(with.end(), {"--display-server", "[::1]:14158"});
+    EXPECT_EQ(Parse(with).display_server, "[::1]:14158");
+    with.back() = "14158";
+    EXPECT_THAT(Refusal(with), HasSubstr("--display-server 14158: expected HOST:PORT"));
+  }
+  EXPECT_THAT(
+      Refusal({"submit", "a.glb", "--detach", "--coordinator", "h:1", "--display-server", "h:2"}),
+      HasSubstr("with --detach no tile arrives here"));
+  EXPECT_THAT(Refusal({"watch", "1", "2", "--coordinator", "h:1", "--display-server", "h:2"}),
+              HasSubstr("shows one job"));
+}
+
 TEST(CommandLine, DetachNeedsNoOutputButTakesOne) {
   EXPECT_TRUE(Parse({"submit", "a.glb", "--detach", "--coordinator", "h:1"}).detach);
   const CommandLine line =

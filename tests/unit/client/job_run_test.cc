@@ -357,6 +357,71 @@ TEST_F(JobRunTest, AFullDiskEndsTheWait) {
   EXPECT_EQ(run_.Wait(JobId{"1"}, Sink()), sink_status_);
 }
 
+class ShownTiles : public JobRunTest {
+ protected:
+  void SetUp() override {
+    farm_.UncommitAll();
+    run_.ShowTiles([this](const JobInfo& info, uint32_t tile, const Film& film) {
+      const PixelRect& rect = info.tiles[tile].rect;
+      ASSERT_TRUE(film.rect().Contains(rect));
+      const Film sample = SampleFilm(rect, {Layer::kBeauty, Layer::kDepth});
+      EXPECT_EQ(film.Get(Layer::kBeauty, 1, rect.x0, rect.y0),
+                sample.Get(Layer::kBeauty, 1, rect.x0, rect.y0));
+      shown_.push_back(tile);
+    });
+    // Each tile is committed with its event; the last event ends the job.
+    for (uint32_t tile = 0; tile < 6; ++tile) {
+      farm_.commits_before[tile + 1] = 1;
+      farm_.events.push_back(
+          Event(tile + 1, JobState::kRendering, TileCommitted{tile, farm_.job.tiles[tile].sha256}));
+    }
+    farm_.events.push_back(Event(7, JobState::kDone, JobState::kDone));
+    farm_.events.back().status.frames.done = 1;
+  }
+  std::vector<uint32_t> shown_;
+};
+
+TEST_F(ShownTiles, ComeBeforeTheFrameAndAreFetchedOnce) {
+  size_t shown_before_frame = 0;
+  const FrameSink record = Sink();
+  const absl::Status status =
+      run_.Wait(JobId{"0badcafe"}, [&](const JobInfo& info, FetchedFrame frame) {
+        shown_before_frame = shown_.size();
+        return record(info, std::move(frame));
+      });
+  ASSERT_TRUE(status.ok()) << status;
+  EXPECT_EQ(shown_.front(), 0u);
+  EXPECT_EQ(shown_before_frame, 6u);
+  EXPECT_EQ(farm_.tiles_sent, 6) << "what was shown is not fetched again";
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0)));
+}
+
+TEST_F(ShownTiles, ADamagedOneIsLeftToTheFrame) {
+  farm_.damage_once = {0};
+  const absl::Status status = run_.Wait(JobId{"0badcafe"}, Sink());
+  ASSERT_TRUE(status.ok()) << status;
+  EXPECT_THAT(shown_, testing::UnorderedElementsAre(0, 1, 2, 3, 4, 5));
+  EXPECT_EQ(farm_.tiles_sent, 7);
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0)));
+}
+
+TEST_F(ShownTiles, OneThatCannotBeHadIsNoError) {
+  // The question for the job's tiles fails, for good.
+  farm_.failures = {absl::NotFoundError("gone")};
+  const absl::Status status = run_.Wait(JobId{"0badcafe"}, Sink());
+  ASSERT_TRUE(status.ok()) << status;
+  EXPECT_TRUE(farm_.failures.empty());
+  EXPECT_THAT(shown_, testing::UnorderedElementsAre(0, 1, 2, 3, 4, 5));
+  EXPECT_THAT(hashes_, ElementsAre(HashOfFrame(0)));
+}
+
+TEST_F(ShownTiles, NobodyFetchesForNoViewer) {
+  run_.ShowTiles(nullptr);
+  ASSERT_TRUE(run_.Wait(JobId{"0badcafe"}).ok());
+  EXPECT_EQ(farm_.tiles_sent, 0);
+  EXPECT_EQ(farm_.watched_after.size(), 1u);
+}
+
 TEST(OutcomeOf, IsOkOnlyForADoneJob) {
   JobStatus status;
   status.state = JobState::kDone;
