@@ -112,12 +112,9 @@ Scene MapYard(bool sun) {
   return scene;
 }
 
-struct Receiver {
-  Vec3f p, n;
-};
-
 // Spread by area over what does not emit, or over all if everything emits; inside of closed rooms.
-std::vector<Receiver> Receivers(const PreparedScene& scene, uint32_t count, bool room) {
+std::vector<SurfacePoint> Receivers(const RayAccel& accel, uint32_t count, bool room) {
+  const PreparedScene& scene = accel.scene();
   std::vector<uint32_t> triangles;
   double area = 0;
   for (const bool any : {false, true}) {
@@ -128,7 +125,7 @@ std::vector<Receiver> Receivers(const PreparedScene& scene, uint32_t count, bool
     }
     if (area > 0) break;
   }
-  std::vector<Receiver> out;
+  std::vector<SurfacePoint> out;
   Numbers random(4);
   double below = 0;
   for (const uint32_t t : triangles) {
@@ -136,9 +133,10 @@ std::vector<Receiver> Receivers(const PreparedScene& scene, uint32_t count, bool
     while (out.size() < count && (static_cast<double>(out.size()) + 0.5) / count * area < below) {
       const Vec2f b =
           UniformTriangle(static_cast<float>(random.Next()), static_cast<float>(random.Next()));
-      Receiver r{scene.PointOn(t, b.x, b.y), scene.GeometricNormal(t)};
-      if (room ? Dot(r.p, r.n) > 0 : r.n.y < -0.5f) r.n = -r.n;
-      out.push_back(r);
+      const Vec3f p = scene.PointOn(t, b.x, b.y);
+      Vec3f n = scene.GeometricNormal(t);
+      if (room ? Dot(p, n) > 0 : n.y < -0.5f) n = -n;
+      out.push_back({p, n, n, accel.SurfaceOffsetM(t, p, n)});
     }
   }
   return out;
@@ -159,7 +157,7 @@ class Bench {
     const auto start = Clock::now();
     const LightSampler sampler(accel);
     out.prepare_s = SecondsSince(start);
-    const std::vector<Receiver> receivers = Receivers(*prepared, options_.receivers, room);
+    const std::vector<SurfacePoint> receivers = Receivers(*accel, options_.receivers, room);
     // Punctual lights all have a ray if there are as many samples.
     const auto reference_samples =
         static_cast<uint32_t>(scene.lights.empty() ? options_.reference_samples
@@ -168,9 +166,9 @@ class Bench {
     double mean = 0;
     for (size_t i = 0; i < receivers.size(); ++i) {
       LightCounters unused;
-      const Receiver& r = receivers[i];
-      truth.emplace_back(sampler.Irradiance(r.p, r.n, r.n, reference_samples,
-                                            HashKey(options_.seed, 1, i), 0, 0, unused));
+      const SurfacePoint& r = receivers[i];
+      truth.emplace_back(
+          sampler.Irradiance(r, reference_samples, HashKey(options_.seed, 1, i), 0, 0, unused));
       mean += truth.back().y;
     }
     if (!(mean > 0)) return absl::InternalError(kind + ": nothing is lit");
@@ -183,8 +181,8 @@ class Bench {
     for (uint64_t round = 0; round == 0 || (seconds < 0.2 && !options_.quick); ++round) {
       const auto begin = Clock::now();
       for (size_t i = 0; i < receivers.size(); ++i) {
-        const Receiver& r = receivers[i];
-        estimate[i] = sampler.Irradiance(r.p, r.n, r.n, options_.light_samples,
+        const SurfacePoint& r = receivers[i];
+        estimate[i] = sampler.Irradiance(r, options_.light_samples,
                                          HashKey(options_.seed, 2, round, i), 0, 0, counters);
       }
       seconds += SecondsSince(begin);

@@ -6,6 +6,7 @@
 #include "core/image/tile_rect.h"
 #include "core/math/sampling.h"
 #include "core/render/camera_rays.h"
+#include "core/render/record_gatherer.h"
 #include "core/scene/procedural.h"
 
 namespace farpoint {
@@ -46,16 +47,7 @@ void TraceBlock(const Camera& camera, int side, MicroWorkload& work) {
       work.coherent.push_back({rays.eye(), w});
       const std::optional<RayHit> hit = work.accel->Intersect(rays.eye(), w);
       if (!hit) continue;
-      Receiver r;
-      r.position = work.scene->PointOn(hit->triangle, hit->b1, hit->b2);
-      r.geometric_normal = work.scene->GeometricNormal(hit->triangle);
-      r.normal = work.scene->ShadingNormal(hit->triangle, hit->b1, hit->b2);
-      r.on_back = Dot(r.geometric_normal, w) > 0.0f;
-      if (r.on_back) {
-        r.geometric_normal = -r.geometric_normal;
-        r.normal = -r.normal;
-      }
-      work.receivers.push_back(r);
+      work.receivers.push_back(ReceiverOfHit(*work.accel, *hit, w));
     }
   }
 }
@@ -67,8 +59,7 @@ void ScatterRays(MicroWorkload& work) {
     const uint32_t seed = static_cast<uint32_t>(HashKey(kSeed, i));
     for (uint32_t s = 0; s < kRaysPerReceiver; ++s) {
       const Vec3f local = CosineHemisphere(OwenSobol(s, 0, seed), OwenSobol(s, 1, seed));
-      work.incoherent.push_back(
-          {work.accel->LeaveSurface(r.position, r.geometric_normal), frame.ToWorld(local)});
+      work.incoherent.push_back({r.Leave(), frame.ToWorld(local)});
     }
   }
 }

@@ -41,7 +41,7 @@ absl::StatusOr<Workload> Make(const std::string& name, const SceneChanges& chang
     for (int x = 0; x < side; ++x) {
       const Vec3f w = camera.Direction(x + 0.5, y + 0.5);
       const std::optional<RayHit> hit = work.accel->Intersect(camera.eye(), w);
-      if (hit) work.receivers.push_back(ReceiverOfHit(*scene, *hit, w));
+      if (hit) work.receivers.push_back(ReceiverOfHit(*work.accel, *hit, w));
     }
   }
   FP_ASSIGN_OR_RETURN(const auto recorder, RayAccel::Build(scene, &work.rays));

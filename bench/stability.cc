@@ -221,6 +221,33 @@ class Runner {
     });
   }
 
+  // What lies far away, however far, changes nothing here.
+  absl::Status Strays() {
+    return OnCornell(
+        "invariance",
+        Concat({"an object or a black ground that reaches far beyond the box, which itself is not ",
+                "changed: ", kTruthCheck}),
+        [&](const Base& base) {
+          const StabilityScene& source = base.source;
+          for (const double away_m : {1e3, 1e5, 1e7, 1e12}) {
+            FP_RETURN_IF_ERROR(SameError(
+                base, {WithStray(source.scene, Vec3d(0.3, -0.5, 0.8) * away_m), source.camera},
+                absl::StrFormat("a triangle %g m away", away_m)));
+          }
+          for (const double half_m : {1e3, 1e5}) {
+            const StabilityScene on_ground = {WithBlackGround(source.scene, half_m, -0.1),
+                                              source.camera};
+            FP_RETURN_IF_ERROR(
+                SameError(base, on_ground, absl::StrFormat("a ground of +-%g m", half_m)));
+          }
+          const Affine slope = RotationAbout({1, 2, 3}, 37 * kPi / 180);
+          return SameError(
+              base,
+              Transformed({WithBlackGround(source.scene, 1e3, -0.1), source.camera}, slope, 1),
+              "a ground of +-1000 m, all turned by 37°");
+        });
+  }
+
   // --- Degenerate geometry ---
 
   absl::Status FlatTriangles() {
@@ -914,6 +941,7 @@ constexpr Case kCases[] = {
     {"mirror", &Runner::Mirror},
     {"permute", &Runner::Permute},
     {"split", &Runner::SplitMeshes},
+    {"strays", &Runner::Strays},
     {"flat-triangles", &Runner::FlatTriangles},
     {"needles", &Runner::Needles},
     {"duplicates", &Runner::Duplicates},

@@ -226,6 +226,41 @@ Scene WithFlatMeshes(const Scene& source) {
   return out;
 }
 
+Scene WithStray(const Scene& source, const Vec3d& at) {
+  Scene out = source;
+  Mesh mesh;
+  mesh.name = "stray";
+  mesh.positions = {{0, 0, 0}, {1, 0, 0}, {0, 1, 0}};
+  mesh.triangles = {{0, 1, 2}};
+  Instance instance;
+  instance.name = "stray";
+  instance.mesh = static_cast<uint32_t>(out.meshes.size());
+  instance.world_from_mesh = TranslationBy(at);
+  out.meshes.push_back(std::move(mesh));
+  out.instances.push_back(std::move(instance));
+  return out;
+}
+
+Scene WithBlackGround(const Scene& source, double half_m, double y) {
+  Scene out = source;
+  const auto h = static_cast<float>(half_m), height = static_cast<float>(y);
+  Mesh mesh;
+  mesh.name = "ground";
+  mesh.positions = {{-h, height, -h}, {-h, height, h}, {h, height, h}, {h, height, -h}};
+  mesh.triangles = {{0, 1, 2}, {0, 2, 3}};
+  mesh.material = static_cast<int32_t>(out.materials.size());
+  Material black;
+  black.name = "black";
+  black.base_color = Rgb();
+  out.materials.push_back(std::move(black));
+  Instance instance;
+  instance.name = "ground";
+  instance.mesh = static_cast<uint32_t>(out.meshes.size());
+  out.meshes.push_back(std::move(mesh));
+  out.instances.push_back(std::move(instance));
+  return out;
+}
+
 Scene WithNeedles(const Scene& source) {
   Scene out = source;
   for (Mesh& mesh : out.meshes) {

@@ -41,6 +41,11 @@ Scene Split(const Scene& source);
 Scene WithFlatTriangles(const Scene& source);
 // The same triangles, but in meshes of their own.
 Scene WithFlatMeshes(const Scene& source);
+// With a white triangle of half a square metre at `at`.
+Scene WithStray(const Scene& source, const Vec3d& at);
+// With a black square of 2 `half_m` in the plane y = `y`, about the axis: nothing in a frame knows
+// of it but what sees it.
+Scene WithBlackGround(const Scene& source, double half_m, double y);
 // Each triangle loses a needle, 10^6 times as long as it is wide, along its side opposite to the
 // first corner; the needle is a triangle of its own.
 Scene WithNeedles(const Scene& source);

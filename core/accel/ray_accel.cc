@@ -121,9 +121,7 @@ struct RayAccel::Impl {
 };
 
 RayAccel::RayAccel(std::shared_ptr<const PreparedScene> scene)
-    : scene_(std::move(scene)),
-      surface_offset_m_(scene_->diagonal_m() * (1.0f / 524288.0f)),
-      impl_(std::make_unique<Impl>()) {}
+    : scene_(std::move(scene)), impl_(std::make_unique<Impl>()) {}
 
 RayAccel::~RayAccel() = default;
 

@@ -17,6 +17,7 @@
 #include <span>
 #include <vector>
 
+#include "core/accel/surface_offset.h"
 #include "core/base/status.h"
 #include "core/scene/prepared_scene.h"
 
@@ -77,18 +78,23 @@ class RayAccel {
   // Returns how many hit.
   size_t TraceBare(std::span<const TracedRay> rays) const;
 
-  // Where a ray leaves a surface at `p` on the side of the unit geometric normal `ng`: p moved by
-  // 2^-19 of the scene's diagonal, about eight times the rounding error of a position, so that the
-  // ray does not hit the surface that it leaves. Proportional to the scene: no absolute length.
-  Vec3f LeaveSurface(const Vec3f& p, const Vec3f& ng) const { return p + ng * surface_offset_m_; }
-  float surface_offset_m() const { return surface_offset_m_; }
+  // How far off a triangle rays start at its point `p`, of which `ng` is the unit geometric normal,
+  // either way (surface_offset.h).
+  float SurfaceOffsetM(uint32_t triangle, const Vec3f& p, const Vec3f& ng) const {
+    const auto& v = scene_->triangles()[triangle].vertex;
+    const std::span<const Vec3f> at = scene_->vertices();
+    return SurfaceOffset(at[v[0]], at[v[1]], at[v[2]], ng, p);
+  }
+  // Where a ray leaves the triangle at `p` on the side of `ng`.
+  Vec3f LeaveSurface(uint32_t triangle, const Vec3f& p, const Vec3f& ng) const {
+    return p + ng * SurfaceOffsetM(triangle, p, ng);
+  }
 
  private:
   explicit RayAccel(std::shared_ptr<const PreparedScene> scene);
 
   struct Impl;
   std::shared_ptr<const PreparedScene> scene_;
-  float surface_offset_m_ = 0;
   std::vector<TracedRay>* record_ = nullptr;
   std::unique_ptr<Impl> impl_;
 };

@@ -112,6 +112,7 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   const F8 height = Dot(to_a, e.normal);  // of the plane over the origin, signed
   EmitterDirections out;
   out.height_m = Abs8(height);
+  out.offset_m = SurfaceOffset(e.a, e.b, e.c, e.normal, samples.origin);
   // Else at a corner, or in the triangle's plane: nothing arrives.
   out.any = (length_a > zero) & (length_b > zero) & (length_c > zero) & (out.height_m > zero);
   const F8 inverse_a = one / Max8(length_a, least), inverse_b = one / Max8(length_b, least),
@@ -373,8 +374,9 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
   const auto for_each_lane = [&](size_t i, const auto& from) {
     for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
       const auto k = static_cast<size_t>(std::countr_zero(rest));
-      const Vec3f p = points[i].p.Lane(k), ng = points[i].ng.Lane(k), n = points[i].n.Lane(k);
-      const Query q{p, ng, n, accel_->LeaveSurface(p, ng), 1, key, points[i].index[k], dimension};
+      const SurfacePoint at = points[i].Lane(k);
+      const Query q{at.p,     at.ng, at.n, at.Leave(), at.offset_m, 1, key, points[i].index[k],
+                    dimension};
       irradiance[i].SetLane(k, irradiance[i].Lane(k) + from(q));
     }
   };
@@ -383,9 +385,8 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
       irradiance[i] = V8(Vec3f());
       for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
         const auto k = static_cast<size_t>(std::countr_zero(rest));
-        irradiance[i].SetLane(
-            k, Irradiance(points[i].p.Lane(k), points[i].ng.Lane(k), points[i].n.Lane(k), 1, key,
-                          points[i].index[k], dimension, counters, false, true, needless));
+        irradiance[i].SetLane(k, Irradiance(points[i].Lane(k), 1, key, points[i].index[k],
+                                            dimension, counters, false, true, needless));
       }
     }
     return;
@@ -428,12 +429,11 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
   }
 }
 
-Rgb LightSampler::Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples,
-                             uint64_t key, uint32_t first_index, unsigned dimension,
-                             LightCounters& counters, bool refine, bool environment,
-                             unsigned needless) const {
-  const Query q{p,           ng,        n,       accel_->LeaveSurface(p, ng), samples, key,
-                first_index, dimension, needless};
+Rgb LightSampler::Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t key,
+                             uint32_t first_index, unsigned dimension, LightCounters& counters,
+                             bool refine, bool environment, unsigned needless) const {
+  const Query q{at.p,    at.ng, at.n,        at.Leave(), at.offset_m,
+                samples, key,   first_index, dimension,  needless};
   Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
     irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
@@ -532,8 +532,9 @@ Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
     return {};
   }
   ++counters.rays;
-  // A light's ray ends a surface offset short of it, in case it touches a surface itself.
-  const float t_max = d_m - 2.0f * accel_->surface_offset_m();
+  // A light's ray ends a little short of it, in case it touches a surface itself.
+  const float t_max =
+      d_m - q.offset_m - 2.0f * kOffsetOfPlane * (MaxAbs(light.position) + MaxAbs(q.p));
   if (t_max > 0.0f && accel_->Occluded(q.origin, to_light, t_max)) {
     ++counters.blocked;
     return {};
@@ -647,7 +648,7 @@ LightSampler::EmitterSamples LightSampler::SampleEach(const SurfacePoints8& poin
   const uint32_t seed = static_cast<uint32_t>(HashKey(key, 1));
   const U8 bits = OwenSobolAxis(dimension, seed).BitsOf(points.index);
   EmitterSamples samples;
-  samples.origin = points.p + points.ng * Set8(accel_->surface_offset_m());
+  samples.origin = points.p + points.ng * points.offset_m;
   samples.n = points.n;
   samples.ng = points.ng;
   samples.v = OwenSobolAxis(dimension + 1, seed).PointsOf(points.index);
@@ -685,10 +686,9 @@ LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) co
     rays.origin[k] = samples.origin.Lane(k);
     rays.direction[k] = to.direction.Lane(k);
   }
-  // Up to two surface offsets over the emitter's plane, not along the ray: a grazing ray would
-  // hit the emitter itself.
-  rays.reach_m =
-      to.distance_m * (Set8(1.0f) - Set8(2.0f * accel_->surface_offset_m()) / to.height_m);
+  // Up to two offsets over the emitter's plane, not along the ray: a grazing ray would hit the
+  // emitter itself.
+  rays.reach_m = to.distance_m * (Set8(1.0f) - Set8(2.0f) * to.offset_m / to.height_m);
   rays.active =
       samples.active & Bits8(to.any & (cosine > zero) & (Dot(samples.ng, to.direction) > zero));
   rays.arriving = V8(Vec3f());

@@ -37,9 +37,12 @@ struct LightCounters {
 // Eight surface points side by side, such as the hits of eight paths. Lanes that are not active
 // hold anything.
 struct SurfacePoints8 {
-  V8 p, ng, n;      // as LightSampler::Irradiance takes them
+  V8 p, ng, n;  // as in SurfacePoint
+  F8 offset_m;
   U8 index;         // of the sample within its sequence
   unsigned active;  // bit k: lane k
+
+  SurfacePoint Lane(size_t k) const { return {p.Lane(k), ng.Lane(k), n.Lane(k), offset_m[k]}; }
 };
 
 // What an estimate computes although it cannot matter; values of a mask.
@@ -61,9 +64,8 @@ class LightSampler {
   bool has_emitters() const { return !emitters_.empty(); }
   bool has_sky() const { return has_sky_; }  // a constant one or a map
 
-  // An unbiased estimate of the irradiance [W/m²] at surface point `p` (relative to the scene's
-  // origin) on the side of unit geometric normal `ng`, against shading normal `n`
-  // (Dot(n, ng) >= 0).
+  // An unbiased estimate of the irradiance [W/m²] at a point, on the side of its geometric normal,
+  // against its shading normal.
   // - Emitters: `samples` >= 1 shadow rays to points drawn by a light tree, then by solid angle and
   //   nearly by the cosine.
   // - Point and spot lights: one ray each if there are up to max(samples, kFewLights) of them, else
@@ -72,9 +74,9 @@ class LightSampler {
   // - Environment: `samples` rays, by the cosine if it is a constant sky, else by
   //   EnvironmentSampler.
   // Each of these is stratified (Owen-scrambled Sobol' in two dimensions). Holes of alpha masks
-  // emit nothing. What lies within two surface offsets of an emitter's plane does not shadow it.
-  // `first_index` is the index of the first sample within its sequence and `key` names the
-  // sequence: the same key with disjoint aligned index ranges gives one stratified set.
+  // emit nothing. What lies within two offsets (SurfaceOffset) of an emitter's plane does not
+  // shadow it. `first_index` is the index of the first sample within its sequence and `key` names
+  // the sequence: the same key with disjoint aligned index ranges gives one stratified set.
   // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
   // for the same index take dimensions 0 and 1 passes 2, or the two would be correlated.
   // `refine`: for emitters and for the environment, the samples are two independent halves, and
@@ -83,13 +85,13 @@ class LightSampler {
   // below kFewestRefined samples. Index ranges of one key are then sets of their own.
   // `environment`: false: without what comes from there.
   // `needless`: NeedlessLight; the estimate is the same, bit by bit.
-  Rgb Irradiance(const Vec3f& p, const Vec3f& ng, const Vec3f& n, uint32_t samples, uint64_t key,
-                 uint32_t first_index, unsigned dimension, LightCounters& counters,
-                 bool refine = false, bool environment = true, unsigned needless = 0) const;
+  Rgb Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t key, uint32_t first_index,
+                 unsigned dimension, LightCounters& counters, bool refine = false,
+                 bool environment = true, unsigned needless = 0) const;
 
   static constexpr uint32_t kRefined = 16, kFewestRefined = 4;
 
-  // Irradiance(p, ng, n, 1, key, index, dimension, counters) of each active lane, to the same bits,
+  // Irradiance(at, 1, key, index, dimension, counters) of each active lane, to the same bits,
   // in less than half the time without rays; 0 in the others. `irradiance` is as long as `points`.
   void IrradianceEach(std::span<const SurfacePoints8> points, uint64_t key, unsigned dimension,
                       std::span<V8> irradiance, LightCounters& counters,
@@ -99,7 +101,8 @@ class LightSampler {
   // What an estimate is made for.
   struct Query {
     Vec3f p, ng, n;
-    Vec3f origin;  // of its shadow rays
+    Vec3f origin;    // of its shadow rays
+    float offset_m;  // of the origin from p
     uint32_t samples;
     uint64_t key;
     uint32_t first_index;
@@ -165,6 +168,7 @@ class LightSampler {
     V8 direction;  // unit, world
     F8 distance_m;
     F8 height_m;        // of the origin over the emitter's plane, > 0
+    F8 offset_m;        // SurfaceOffset of the emitter, seen from the origin
     F8 inverse_pdf_sr;  // 1 / density per solid angle, given the emitter
     M8 any;
   };

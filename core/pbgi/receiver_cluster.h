@@ -5,6 +5,7 @@
 #include <span>
 #include <vector>
 
+#include "core/accel/surface_offset.h"
 #include "core/math/vec.h"
 
 namespace farpoint {
@@ -15,6 +16,10 @@ struct Receiver {
   Vec3f normal;            // unit shading normal, towards the viewer
   Vec3f geometric_normal;  // unit, towards the viewer
   bool on_back = false;    // the viewer sees the back of the triangle
+  float offset_m = 0;      // how far off the surface rays start: SurfaceOffset
+
+  Vec3f Leave() const { return position + geometric_normal * offset_m; }  // where they start
+  SurfacePoint surface() const { return {position, geometric_normal, normal, offset_m}; }
 };
 
 struct ClusterParams {

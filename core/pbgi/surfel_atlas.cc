@@ -243,7 +243,7 @@ uint64_t SurfelAtlas::Resolve(const Point& point, const Texel& texel, uint32_t s
   Vec3f surfel;
   const std::optional<Rgb> found = grid_.Find(p, n, front, &surfel);
   if (!found) return kResolved | kNone;
-  const Vec3f lifted = accel_.LeaveSurface(p, out);
+  const Vec3f lifted = accel_.LeaveSurface(triangle, p, out);
   const auto cut_off = [&](const Vec3f& from, const Vec3f& to) {
     const Vec3f d = to - from;
     const float length = Length(d);

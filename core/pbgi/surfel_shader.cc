@@ -54,10 +54,11 @@ std::vector<Vec3f> NormalsOf(const PreparedScene& scene, Executor& executor) {
 }
 
 // Whether all rays that leave `p` on the side of `ng` hit surfaces from behind.
-bool SeesOnlyBackFaces(const RayAccel& accel, const std::vector<Vec3f>& normals, const Vec3f& p,
-                       const Vec3f& ng, const InteriorSet& set, PieceCounts& counts) {
+bool SeesOnlyBackFaces(const RayAccel& accel, const std::vector<Vec3f>& normals, uint32_t triangle,
+                       const Vec3f& p, const Vec3f& ng, const InteriorSet& set,
+                       PieceCounts& counts) {
   const Frame frame(ng);
-  const Vec3f origin = accel.LeaveSurface(p, ng);
+  const Vec3f origin = accel.LeaveSurface(triangle, p, ng);
   for (const Vec3f& local : set) {
     const Vec3f w = frame.ToWorld(local);
     ++counts.interior;
@@ -85,7 +86,8 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
       for (unsigned side = 0; side < 2; ++side) {
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
         const InteriorSet& set = sets[HashKey(key, side, 5) % kInteriorSets];
-        if (!SeesOnlyBackFaces(accel, normals, cloud.position[i], ng, set, counts)) {
+        if (!SeesOnlyBackFaces(accel, normals, cloud.triangle[i], cloud.position[i], ng, set,
+                               counts)) {
           open |= side == 0 ? kFrontVisible : kBackVisible;
         }
       }
@@ -136,7 +138,8 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
           ++counts.black;
           continue;
         }
-        const Rgb e = lights.Irradiance(p, ng, ns, samples, side_key, 0, 0, light_counters,
+        const SurfacePoint at{p, ng, ns, accel.SurfaceOffsetM(t, p, ng)};
+        const Rgb e = lights.Irradiance(at, samples, side_key, 0, 0, light_counters,
                                         /*refine=*/false, /*environment=*/true, options.needless);
         if (!open) {
           if (!(MaxComponent(e) > 0.0f)) {

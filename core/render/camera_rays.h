@@ -56,12 +56,15 @@ class CameraRays {
   double width_, height_, half_height_;
 };
 
-// What an eye sees along the unit direction `w`: the nearest hit, but none within a surface offset.
+// What an eye sees along the unit direction `w`: the nearest hit, but none within the offset of the
+// surface that is hit.
 // An eye that lies on a surface, exactly or by its rounding, sees what lies before it.
 inline std::optional<RayHit> FirstSeen(const RayAccel& accel, const Vec3f& eye, const Vec3f& w) {
   std::optional<RayHit> hit = accel.Intersect(eye, w);
-  const float offset = accel.surface_offset_m();
-  if (!hit || hit->t > offset) return hit;
+  if (!hit) return hit;
+  const float offset =
+      accel.SurfaceOffsetM(hit->triangle, eye, accel.scene().GeometricNormal(hit->triangle));
+  if (hit->t > offset) return hit;
   hit = accel.Intersect(eye + w * offset, w);
   if (hit) hit->t += offset;
   return hit;

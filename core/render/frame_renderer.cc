@@ -442,7 +442,7 @@ class Renderer final : public FrameRenderer {
           sample.albedo = surface.albedo;
           sample.emission = surface.emission;
           sample.receiver = static_cast<uint32_t>(receivers.size());
-          const Receiver r = ReceiverOfHit(scene, *hit, w);
+          const Receiver r = ReceiverOfHit(*scene_.accel, *hit, w);
           sample.depth = rays_.Depth(r.position);
           receivers.push_back(r);
           sample_of.push_back(static_cast<uint32_t>(at));
@@ -472,9 +472,9 @@ class Renderer final : public FrameRenderer {
         continue;
       }
       sample.direct_e = scene_.lights->Irradiance(
-          receivers[r].position, receivers[r].geometric_normal, receivers[r].normal, each,
-          PixelKey(block, sample_of[r], kKeyDirect), (sample_of[r] % settings_.spp) * each, 0,
-          counters, true, !sky_by_records_, NeedlessLightOf(settings_));
+          receivers[r].surface(), each, PixelKey(block, sample_of[r], kKeyDirect),
+          (sample_of[r] % settings_.spp) * each, 0, counters, true, !sky_by_records_,
+          NeedlessLightOf(settings_));
     }
     Add(counters, n);
   }

@@ -30,7 +30,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
   const PreparedScene& scene = accel.scene();
   const Frame8 frame{V8(receiver.normal)};
   const V8 ng(receiver.geometric_normal);
-  const Vec3f origin = accel.LeaveSurface(receiver.position, receiver.geometric_normal);
+  const Vec3f origin = receiver.Leave();
   const auto seed = static_cast<uint32_t>(HashKey(key, 11));
   const OwenSobolAxis axis_u(0, seed), axis_v(1, seed);
   const uint64_t light_key = HashKey(key, 12);

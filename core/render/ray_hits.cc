@@ -3,6 +3,7 @@
 #include <array>
 #include <cstring>
 
+#include "core/accel/surface_offset.h"
 #include "core/base/fp_trap.h"
 #include "core/math/simd4d.h"
 
@@ -90,6 +91,7 @@ SurfacePoints8 SurfaceAt(const RayHits& hits, size_t first) {
   const M8 behind = Dot(points.ng, hits.direction.Load(first)) > zero;
   points.ng = Select8(behind, -points.ng, points.ng);
   points.n = Select8(behind, -points.n, points.n);
+  points.offset_m = SurfaceOffset(a, b, c, points.ng, points.p);
   std::memcpy(&points.index, &hits.index[first], sizeof(points.index));
   return points;
 }

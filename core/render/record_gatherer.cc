@@ -35,7 +35,8 @@ class HitReader {
       : scene_(scene),
         atlas_(atlas),
         near_m_(near_m),
-        origin_(scene.accel->LeaveSurface(receiver.position, receiver.geometric_normal)),
+        origin_(receiver.Leave()),
+        offset_m_(receiver.offset_m),
         light_key_(light_key) {}
 
   // Rays to be read together: up to kRaysTogether.
@@ -103,7 +104,7 @@ class HitReader {
       const RayHit& hit = hits[i];
       if (hit.triangle == kNoTriangle) continue;
       // A hit at the origin itself has no distance: as near as the offset that the ray took.
-      const float t = std::max(hit.t, scene_.accel->surface_offset_m());
+      const float t = std::max(hit.t, offset_m_);
       rays.inverse_distance[i] = 1.0f / t;
       if (atlas_ != nullptr && t > near_m_) {
         far_ray[far_count] = i;
@@ -151,6 +152,7 @@ class HitReader {
   const SurfelAtlas* const atlas_;
   const float near_m_;
   const Vec3f origin_;
+  const float offset_m_;
   const uint64_t light_key_;
 };
 
@@ -234,7 +236,8 @@ float RoundToQuarter(double x) {
 
 }  // namespace
 
-Receiver ReceiverOfHit(const PreparedScene& scene, const RayHit& hit, const Vec3f& w) {
+Receiver ReceiverOfHit(const RayAccel& accel, const RayHit& hit, const Vec3f& w) {
+  const PreparedScene& scene = accel.scene();
   Receiver r;
   r.position = scene.PointOn(hit.triangle, hit.b1, hit.b2);
   r.geometric_normal = scene.GeometricNormal(hit.triangle);
@@ -244,6 +247,7 @@ Receiver ReceiverOfHit(const PreparedScene& scene, const RayHit& hit, const Vec3
     r.geometric_normal = -r.geometric_normal;
     r.normal = -r.normal;
   }
+  r.offset_m = accel.SurfaceOffsetM(hit.triangle, r.position, r.geometric_normal);
   return r;
 }
 
@@ -275,7 +279,7 @@ bool RecordGatherer::ReceiverAt(int x, int y, Receiver& receiver, float& footpri
   const Vec3f w = rays_.Direction(x + 0.5, y + 0.5);
   const std::optional<RayHit> hit = FirstSeen(*scene_.accel, rays_.eye(), w);
   if (!hit) return false;
-  receiver = ReceiverOfHit(*scene_.scene, *hit, w);
+  receiver = ReceiverOfHit(*scene_.accel, *hit, w);
   footprint_m = rays_.FootprintAt(receiver.position);
   return true;
 }
@@ -284,14 +288,12 @@ bool RecordGatherer::ReceiverAlong(const CellProbe& probe, ReceiverPlace& place)
   const std::optional<RayHit> hit =
       scene_.accel->Intersect(probe.origin, probe.direction, probe.length_m);
   if (!hit) return false;
-  place.receiver = ReceiverOfHit(*scene_.scene, *hit, probe.direction);
+  place.receiver = ReceiverOfHit(*scene_.accel, *hit, probe.direction);
   place.footprint_m = rays_.FootprintAt(place.receiver.position);
   const Vec3f to_eye = rays_.eye() - place.receiver.position;
   const float distance = Length(to_eye);
   if (!(Dot(to_eye, place.receiver.geometric_normal) > 0.0f)) return false;
-  if (scene_.accel->Occluded(
-          scene_.accel->LeaveSurface(place.receiver.position, place.receiver.geometric_normal),
-          to_eye / distance, distance)) {
+  if (scene_.accel->Occluded(place.receiver.Leave(), to_eye / distance, distance)) {
     return false;
   }
   return rays_.RasterOf(place.receiver.position, place.x_px, place.y_px);

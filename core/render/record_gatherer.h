@@ -68,6 +68,6 @@ class RecordGatherer final : public PlaceSource {
 };
 
 // The receiver of a hit by a ray of direction `w`, turned towards where the ray came from.
-Receiver ReceiverOfHit(const PreparedScene& scene, const RayHit& hit, const Vec3f& w);
+Receiver ReceiverOfHit(const RayAccel& accel, const RayHit& hit, const Vec3f& w);
 
 }  // namespace farpoint

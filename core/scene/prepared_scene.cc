@@ -29,6 +29,38 @@ constexpr double kMaxOriginM = 0x1p100;
 // A triangle is degenerate if its area is below this part of the scene's squared diagonal, or its
 // height below about this part of its longest edge.
 constexpr double kMinAreaRatio = 0x1p-60;
+// A scene so many times the size of its bulk has strays: a backdrop, a forgotten object.
+constexpr double kStrayRatio = 16;
+
+// Evenly picked vertices, up to 2^16, that tell where most of a scene lies.
+class VertexSample {
+ public:
+  void Add(const Vec3d& p) {
+    if (seen_++ % stride_ != 0) return;
+    picked_.push_back(p);
+    if (picked_.size() < kMost) return;
+    for (size_t i = 0; 2 * i < picked_.size(); ++i) picked_[i] = picked_[2 * i];
+    picked_.resize(kMost / 2);
+    stride_ *= 2;
+  }
+  // The box that leaves out an eighth at either end of each axis. Precondition: one was added.
+  Box3d Bulk() {
+    const auto low = picked_.size() / 8, high = picked_.size() - 1 - low;
+    const auto component = [&](double Vec3d::*c, size_t rank) {
+      std::ranges::nth_element(picked_, picked_.begin() + static_cast<std::ptrdiff_t>(rank), {}, c);
+      return picked_[rank].*c;
+    };
+    Box3d box;
+    box.min = {component(&Vec3d::x, low), component(&Vec3d::y, low), component(&Vec3d::z, low)};
+    box.max = {component(&Vec3d::x, high), component(&Vec3d::y, high), component(&Vec3d::z, high)};
+    return box;
+  }
+
+ private:
+  static constexpr size_t kMost = 1u << 16;
+  uint64_t seen_ = 0, stride_ = 1;
+  std::vector<Vec3d> picked_;
+};
 constexpr double kMinSliverRatio = 0x1p-44;
 constexpr float kMaxRadiance = 1e15f;
 constexpr float kMaxUvFactor = 1e10f;
@@ -280,6 +312,7 @@ class Builder {
 
   absl::Status FindOrigin() {
     Box3d bounds;
+    VertexSample sample;
     uint64_t vertices = 0, triangles = 0;
     for (const Instance& instance : scene_.instances) {
       const Mesh& mesh = MeshOf(instance);
@@ -299,12 +332,16 @@ class Builder {
                                             "instance's transform");
         }
         bounds.Extend(p);
+        sample.Add(p);
       }
     }
     vertices_.reserve(vertices);
     triangles_.reserve(triangles);
     if (bounds.empty()) return absl::OkStatus();
-    origin_ = bounds.Center();
+    // Where the floats are finest: in the middle, but of what most of the scene is.
+    const Box3d bulk = sample.Bulk();
+    const bool strays = bounds.Diagonal() > kStrayRatio * bulk.Diagonal() && bulk.Diagonal() > 0;
+    origin_ = strays ? bulk.Center() : bounds.Center();
     const double diagonal = bounds.Diagonal();
     if (!(diagonal < kMaxExtentM)) {
       return absl::InvalidArgumentError(
@@ -321,7 +358,8 @@ class Builder {
           "the scene is less than 2^-30 m across, below which areas lose their precision; scale it "
           "up");
     }
-    min_area_ = kMinAreaRatio * diagonal * diagonal;
+    const double extent = strays ? bulk.Diagonal() : diagonal;
+    min_area_ = kMinAreaRatio * extent * extent;
     return absl::OkStatus();
   }
 

@@ -40,6 +40,13 @@ constexpr Known kKnown[] = {
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: rr against pt", 2},
     {"lights-on-surfaces", "pbgi", "a light inside the tall box: bias, without its sign", 1.3},
     {"cameras-in-walls", "pbgi", "inside the tall box: largest E over the room's mean", 0.6},
+    // The ground takes nearly all of the surfels.
+    {"strays", "pbgi", "a ground of +-1000 m: rr against pt", 1},
+    {"strays", "pbgi", "a ground of +-1000 m: the bias moves by", 0.7},
+    {"strays", "pbgi", "a ground of +-100000 m: rr against pt", 1},
+    {"strays", "pbgi", "a ground of +-100000 m: the bias moves by", 0.7},
+    {"strays", "pbgi", "a ground of +-1000 m, all turned by 37°: rr against pt", 1},
+    {"strays", "pbgi", "a ground of +-1000 m, all turned by 37°: the bias moves by", 0.7},
     // 2,500 surfels leave gaps.
     {"thin-wall", "pbgi", "a wall of no thickness: mean leak", 0.01},
     {"thin-wall", "pbgi", "a wall of a tenth of the surfels' spacing: mean leak", 0.01},

@@ -36,10 +36,14 @@ class Lit {
   // Whether something lies on the way from p by all but the end of v.
   bool Hides(const Vec3d& p_world, const Vec3f& n, const Vec3d& v) const {
     const double d = Length(v);
-    return accel_->Occluded(accel_->LeaveSurface(Local(p_world), n), Vec3f(v / d),
+    return accel_->Occluded(At(Local(p_world), n, n).Leave(), Vec3f(v / d),
                             static_cast<float>(d * (1 - 1e-4)));
   }
-  double surface_offset_m() const { return static_cast<double>(accel_->surface_offset_m()); }
+  // A point that need not lie on a triangle.
+  SurfacePoint At(const Vec3f& p, const Vec3f& ng, const Vec3f& n) const {
+    return {p, ng, n, offset_m()};
+  }
+  float offset_m() const { return scene().diagonal_m() * 0x1p-19f; }
   Vec3f Local(const Vec3d& p_world) const { return Vec3f(p_world - scene().origin()); }
 
   Rgb E(const Vec3d& p_world, const Vec3f& n, uint32_t samples = 64, uint64_t key = 1) const {
@@ -48,7 +52,7 @@ class Lit {
   }
   Rgb E(const Vec3d& p_world, const Vec3f& n, uint32_t samples, uint64_t key,
         LightCounters& counters) const {
-    return sampler_->Irradiance(Local(p_world), n, n, samples, key, 0, 0, counters);
+    return sampler_->Irradiance(At(Local(p_world), n, n), samples, key, 0, 0, counters);
   }
 
  private:
@@ -310,7 +314,7 @@ TEST(RectangularEmitter, MatchesAtGrazingAngles) {
     const Lit lit(scene);
     for (const Vec3d& n : {y, x}) {
       // Rays start at an offset from the surface, which is seen here.
-      const Vec3d start = n * lit.surface_offset_m();
+      const Vec3d start = n * static_cast<double>(lit.offset_m());
       const Estimate e = OverKeys(lit, {0, 0, 0}, Vec3f(n), 64, 64);
       const double expected = PolygonIrradiance(q, start, n);
       EXPECT_NEAR(e.mean(), expected, 4 * e.standard_error() + 1e-6 / height * expected);
@@ -366,7 +370,8 @@ TEST(Emitters, TrianglesOfAllShapesMatchTheClosedForm) {
     AddQuad(scene, FloorQuad(0.01, -1e-3), Material());
     const Lit lit(scene);
     const Estimate e = OverKeys(lit, {0, 0, 0}, kUp, 32, 256);
-    const double expected = PolygonIrradiance(corner, {0, lit.surface_offset_m(), 0}, {0, 1, 0});
+    const double expected =
+        PolygonIrradiance(corner, {0, static_cast<double>(lit.offset_m()), 0}, {0, 1, 0});
     EXPECT_NEAR(e.mean(), expected, 5 * e.standard_error() + 5e-5 * expected);
     EXPECT_LT(e.standard_error(), 0.01 * expected);
   }
@@ -403,6 +408,7 @@ TEST(IrradianceEach, IsIrradianceOfEachPointAlone) {
         points[i].ng.SetLane(k, kUp);
         points[i].n.SetLane(k, Normalize(Vec3f(static_cast<float>(random.Uniform(-0.3, 0.3)), 1,
                                                static_cast<float>(random.Uniform(-0.3, 0.3)))));
+        points[i].offset_m[k] = lit.offset_m();
         points[i].index[k] = static_cast<uint32_t>(8 * i + k + (i > 5 ? 1000 : 0));
       }
       points[i].active = i == 3 ? 0u : i == 4 ? 0x51u : 0xffu;
@@ -415,8 +421,7 @@ TEST(IrradianceEach, IsIrradianceOfEachPointAlone) {
       for (size_t k = 0; k < 8; ++k) {
         Rgb alone;
         if ((points[i].active >> k & 1u) != 0) {
-          alone = lit.sampler().Irradiance(points[i].p.Lane(k), points[i].ng.Lane(k),
-                                           points[i].n.Lane(k), 1, 99, points[i].index[k], 2,
+          alone = lit.sampler().Irradiance(points[i].Lane(k), 1, 99, points[i].index[k], 2,
                                            counters_alone);
           (alone.x > 0 ? lit_anywhere : dark_anywhere) = true;
         }
@@ -473,7 +478,7 @@ TEST(Emitters, AClosedBoxGivesPiL) {
     const Vec3f n = scene.GeometricNormal(t);  // the fronts face inwards
     LightCounters counters;
     e.Add(static_cast<double>(
-        lit.sampler().Irradiance(p, n, n, 32, random.Bits(), 0, 0, counters).x));
+        lit.sampler().Irradiance(lit.At(p, n, n), 32, random.Bits(), 0, 0, counters).x));
   }
   EXPECT_NEAR(e.mean(), 2 * kPi, 4 * e.standard_error());
   EXPECT_LT(e.standard_error(), 0.005 * e.mean());
@@ -582,7 +587,7 @@ TEST(Sky, BelowTheSurfaceIsDark) {
   const Lit lit(scene);
   const Vec3f n(static_cast<float>(std::sin(kPi / 3)), 0.5f, 0);
   LightCounters counters;
-  const Rgb e = lit.sampler().Irradiance({0, 0, 0}, kUp, n, 4096, 9, 0, 0, counters);
+  const Rgb e = lit.sampler().Irradiance(lit.At({0, 0, 0}, kUp, n), 4096, 9, 0, 0, counters);
   EXPECT_NEAR(e.x, 0.75 * kPi, 0.005 * kPi);
   EXPECT_LT(counters.rays, 4096u);
   EXPECT_GT(counters.rays, 2048u);
@@ -922,8 +927,8 @@ TEST(LightSampler, BothPairsOfDimensionsAreUnbiasedAndDifferent) {
   Estimate e[2];
   for (uint64_t key = 0; key < 600; ++key) {
     LightCounters counters;
-    const float a = lit.sampler().Irradiance(p, kUp, kUp, 4, key, 0, 0, counters).x;
-    const float b = lit.sampler().Irradiance(p, kUp, kUp, 4, key, 0, 2, counters).x;
+    const float a = lit.sampler().Irradiance(lit.At(p, kUp, kUp), 4, key, 0, 0, counters).x;
+    const float b = lit.sampler().Irradiance(lit.At(p, kUp, kUp), 4, key, 0, 2, counters).x;
     e[0].Add(static_cast<double>(a));
     e[1].Add(static_cast<double>(b));
   }
@@ -949,7 +954,9 @@ TEST(LightSampler, IndexRangesOfOneKeyAreOneSet) {
     for (uint32_t r = 0; r < ranges; ++r) {
       LightCounters counters;
       sum += static_cast<double>(
-          lit.sampler().Irradiance(p, kUp, kUp, samples, key, first + r * samples, 0, counters).x);
+          lit.sampler()
+              .Irradiance(lit.At(p, kUp, kUp), samples, key, first + r * samples, 0, counters)
+              .x);
     }
     return sum / ranges;
   };
@@ -992,10 +999,10 @@ TEST(LightSampler, RefinesPenumbrasOnly) {
   quad({-9, -9, 0}, {9, -9, 0}, {9, 9, 0}, {-9, 9, 0}, 0);  // floor
   const Lit lit(scene);
   const auto estimate = [&](double x, bool refine, uint64_t key, LightCounters& counters) {
-    return static_cast<double>(
-        lit.sampler()
-            .Irradiance(lit.Local({x, 0, 0}), {0, 0, 1}, {0, 0, 1}, 8, key, 0, 0, counters, refine)
-            .x);
+    return static_cast<double>(lit.sampler()
+                                   .Irradiance(lit.At(lit.Local({x, 0, 0}), {0, 0, 1}, {0, 0, 1}),
+                                               8, key, 0, 0, counters, refine)
+                                   .x);
   };
   for (const double x : {-3.0, 3.0}) {  // all of the panel is seen, none of it
     LightCounters a, b;
@@ -1031,7 +1038,7 @@ TEST(LightSampler, RefiningIsUnbiasedWhateverTheShareThatIsSeen) {
     LightCounters counters;
     const auto estimate = [&](uint32_t samples, uint64_t key, bool refine) {
       return static_cast<double>(lit.sampler()
-                                     .Irradiance(lit.Local({0, 0, 0}), {0, 0, 1}, {0, 0, 1},
+                                     .Irradiance(lit.At(lit.Local({0, 0, 0}), {0, 0, 1}, {0, 0, 1}),
                                                  samples, key, 0, 0, counters, refine)
                                      .x);
     };
@@ -1079,7 +1086,8 @@ TEST(LightSampler, LightsBehindTheSurfaceCostNoRay) {
   // In front of the shading normal but behind the surface counts as behind.
   const Vec3f n(0.99f, std::sqrt(1 - 0.99f * 0.99f), 0);
   LightCounters tilted;
-  const Rgb e = lit.sampler().Irradiance(lit.Local({0, 0, 0}), {1, 0, 0}, n, 32, 1, 0, 0, tilted);
+  const Rgb e =
+      lit.sampler().Irradiance(lit.At(lit.Local({0, 0, 0}), {1, 0, 0}, n), 32, 1, 0, 0, tilted);
   EXPECT_GE(e.x, 0);
   EXPECT_LT(tilted.rays, 32u + 3u);
 }
@@ -1168,7 +1176,7 @@ TEST(LightSampler, RandomInputGivesFiniteValues) {
       Vec3f n(random.Direction());
       if (Dot(n, ng) < 0) n = -n;
       LightCounters counters;
-      const Rgb e = lit.sampler().Irradiance(p, ng, n, 8, random.Bits(), 0, 0, counters);
+      const Rgb e = lit.sampler().Irradiance(lit.At(p, ng, n), 8, random.Bits(), 0, 0, counters);
       ASSERT_TRUE(IsFinite(e)) << "round " << round << ", point " << i;
       ASSERT_GE(std::min({e.x, e.y, e.z}), 0);
     }
@@ -1208,10 +1216,10 @@ TEST(LightSampler, ScalesExactlyByPowersOfTwo) {
       const Vec3f n = one.scene().GeometricNormal(t);
       ASSERT_EQ(other.scene().GeometricNormal(t), n);
       LightCounters counters;
-      const Rgb a = one.sampler().Irradiance(one.scene().PointOn(t, b1f, b2f), n, n, 8,
+      const Rgb a = one.sampler().Irradiance(one.At(one.scene().PointOn(t, b1f, b2f), n, n), 8,
                                              static_cast<uint64_t>(i), 0, 0, counters);
-      const Rgb b = other.sampler().Irradiance(other.scene().PointOn(t, b1f, b2f), n, n, 8,
-                                               static_cast<uint64_t>(i), 0, 0, counters);
+      const Rgb b = other.sampler().Irradiance(other.At(other.scene().PointOn(t, b1f, b2f), n, n),
+                                               8, static_cast<uint64_t>(i), 0, 0, counters);
       EXPECT_EQ(a, b) << "scale " << scale << ", point " << i;
       lit += a.x > 0;
     }

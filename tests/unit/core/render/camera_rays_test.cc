@@ -128,7 +128,9 @@ TEST(FirstSeen, AnEyeOnASurfaceSeesWhatLiesBeforeIt) {
   const auto scene = PreparedScene::Prepare(MakeCornellBox(), executor).value();
   const auto accel = RayAccel::Build(scene).value();
   const Vec3f eye(Vec3d(2, 0, 3) - scene->origin());
-  const float offset = accel->surface_offset_m();
+  const auto below = accel->Intersect(eye + Vec3f(0, 1, 0), {0, -1, 0});
+  ASSERT_TRUE(below.has_value());
+  const float offset = accel->SurfaceOffsetM(below->triangle, eye, {0, 1, 0});
   for (const Vec3f& on : {eye, eye - Vec3f(0, 0.25f, 0) * offset}) {
     const auto up = FirstSeen(*accel, on, {0, 1, 0});
     ASSERT_TRUE(up.has_value());

@@ -25,7 +25,7 @@ struct World {
   }
   const PreparedScene& scene() const { return accel->scene(); }
   Receiver At(const Vec3d& p_world, const Vec3f& n) const {
-    return {Vec3f(p_world - scene().origin()), n, n, false};
+    return {Vec3f(p_world - scene().origin()), n, n, false, scene().diagonal_m() * 0x1p-19f};
   }
   TracedIrradiance Trace(const Receiver& r, uint32_t paths, uint64_t key) const {
     LightCounters counters;
@@ -116,8 +116,7 @@ Rgb OneByOne(const World& world, const Receiver& r, uint32_t paths, uint64_t key
   for (uint32_t i = 0; i < paths; ++i) {
     const Vec3f w = frame.ToWorld(CosineHemisphere(OwenSobol(i, 0, seed), OwenSobol(i, 1, seed)));
     if (!(Dot(w, r.geometric_normal) > 0.0f)) continue;
-    const auto hit =
-        world.accel->Intersect(world.accel->LeaveSurface(r.position, r.geometric_normal), w);
+    const auto hit = world.accel->Intersect(r.Leave(), w);
     if (!hit) continue;
     Vec3f ng = scene.GeometricNormal(hit->triangle);
     Vec3f n = scene.ShadingNormal(hit->triangle, hit->b1, hit->b2, ng);
@@ -125,8 +124,10 @@ Rgb OneByOne(const World& world, const Receiver& r, uint32_t paths, uint64_t key
       ng = -ng;
       n = -n;
     }
-    const Rgb e = world.lights->Irradiance(scene.PointOn(hit->triangle, hit->b1, hit->b2), ng, n, 1,
-                                           HashKey(key, 12), i, 2, counters);
+    const Vec3f p = scene.PointOn(hit->triangle, hit->b1, hit->b2);
+    const Rgb e =
+        world.lights->Irradiance({p, ng, n, world.accel->SurfaceOffsetM(hit->triangle, p, ng)}, 1,
+                                 HashKey(key, 12), i, 2, counters);
     sum += Vec3d(scene.Surface(hit->triangle, hit->b1, hit->b2).albedo * e);
   }
   return Rgb(sum / static_cast<double>(paths));

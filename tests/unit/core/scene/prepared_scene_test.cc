@@ -94,6 +94,31 @@ TEST(PreparedScene, HoldsPrecisionFarFromZero) {
   for (size_t v = 0; v < 3; ++v) EXPECT_EQ(p->vertices()[v], near->vertices()[v]);
 }
 
+TEST(PreparedScene, HoldsPrecisionBesideWhatLiesFarAway) {
+  // A room's worth of small triangles about (3, 1, -2) and a few that lie 10^8 m away.
+  Mesh mesh;
+  for (int i = 0; i < 200; ++i) {
+    const bool far = i % 20 == 7;
+    const Vec3f at = far ? Vec3f(1e8f, -2e8f, 3e8f) : Vec3f(3, 1, -2);
+    const Vec3f p = at + Vec3f(0.1f * static_cast<float>(i % 11), 0.1f * static_cast<float>(i % 7),
+                               0.1f * static_cast<float>(i % 5));
+    const float side = far ? 100.0f : 1.0f;
+    mesh.positions.insert(mesh.positions.end(), {p, p + Vec3f(side, 0, 0), p + Vec3f(0, side, 0)});
+    const auto first = static_cast<uint32_t>(3 * i);
+    mesh.triangles.push_back({first, first + 1, first + 2});
+  }
+  Scene scene;
+  scene.meshes.push_back(mesh);
+  scene.instances.push_back({"only", 0, {}});
+  const Prepared p = PrepareOk(scene);
+  EXPECT_LT(MaxAbs(p->origin() - Vec3d(3.5, 1.5, -2)), 2.0);
+  ASSERT_EQ(p->triangles().size(), 200u);  // the small ones are not taken for degenerate
+  for (size_t i = 0; i < 60; ++i) {
+    if (i / 3 == 7) continue;
+    EXPECT_LT(MaxAbs(Vec3d(p->vertices()[i]) + p->origin() - Vec3d(mesh.positions[i])), 1e-6);
+  }
+}
+
 TEST(PreparedScene, KeepsFrontsOfMirroredAndStretchedInstances) {
   // Each transform, and the normal that the front then has: the inverse transpose.
   for (int i = 0; i < 64; ++i) {
