@@ -3,9 +3,10 @@
 //
 // Positions are float offsets from `origin` (in double: the centre of the world bounding box, or,
 // where that is 16 times the size of the box that holds most of the scene, of the latter), so that
-// neither a scene far from zero nor one with a few objects far away loses precision. Triangles of degenerate area are kept out: what
-// is left has an area and a normal in float. Scaling a scene by a power of two scales positions
-// and lengths exactly and leaves all else as it is, bit by bit. Immutable, so thread-safe.
+// neither a scene far from zero nor one with a few objects far away loses precision. Triangles of
+// degenerate area are kept out: what is left has an area and a normal in float. Scaling a scene by
+// a power of two scales positions and lengths exactly and leaves all else as it is, bit by bit.
+// Immutable, so thread-safe.
 #pragma once
 
 #include <array>
