@@ -50,6 +50,7 @@ Json ToJson(const JobStatus& status) {
   json["title"] = status.title;
   json["owner"] = status.owner;
   json["priority"] = status.priority;
+  json["suspect_tiles"] = status.suspect_tiles;
   json["error"] = status.error.ok() ? Json(nullptr) : Json(std::string(status.error.message()));
   return json;
 }
@@ -235,6 +236,11 @@ std::string FarmStatusText(const FarmStatus& status) {
       text += "\n";
     }
     if (!job.error.ok()) text += "          " + std::string(job.error.message()) + "\n";
+    if (job.suspect_tiles > 0) {
+      text += "          " + std::to_string(job.suspect_tiles) +
+              " tiles are of a worker that returned wrong pixels elsewhere; farpoint requeue " +
+              job.id.value + " renders them again\n";
+    }
   }
   if (!status.workers.empty()) text += "\n" + WorkersText(status.workers);
   return text;

@@ -835,6 +835,7 @@ absl::StatusOr<JobStatus> JobStatusFromWire(const v1::JobStatus& wire) {
   status.frames = {frames.total(), frames.baked(), frames.done()};
   FP_ASSIGN_OR_RETURN(status.after, JobIdsFromWire(wire.after(), "status.after"));
   status.owner = wire.owner();
+  status.suspect_tiles = wire.suspect_tiles();
   return status;
 }
 v1::JobStatus ToWire(const JobStatus& status) {
@@ -861,6 +862,7 @@ v1::JobStatus ToWire(const JobStatus& status) {
   wire.mutable_frames()->set_done(status.frames.done);
   for (const JobId& id : status.after) wire.add_after(id.value);
   wire.set_owner(status.owner);
+  wire.set_suspect_tiles(status.suspect_tiles);
   return wire;
 }
 

@@ -192,6 +192,8 @@ struct JobStatus {
   FrameCounts frames;
   std::vector<JobId> after;
   std::string owner;  // who submitted it; empty: not known
+  // Committed tiles of workers that were found to return wrong pixels after this job had ended.
+  uint32_t suspect_tiles = 0;
 };
 
 struct WorkerStatus {
@@ -312,6 +314,9 @@ struct WorkerHello {
   Digest fingerprint;
   uint32_t threads = 1;
   std::string name;  // for people, at most 200 bytes
+  // The name in the worker's certificate, which the coordinator read itself; never sent. Empty
+  // without TLS.
+  std::string certified_as;
 };
 struct WorkerWelcome {
   WorkerId id;

@@ -258,7 +258,7 @@ class CoordinatorImpl final : public Coordinator {
     {
       std::lock_guard lock(mutex_);
       FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
-      if (job->stored.state == JobState::kDone && !all) return absl::OkStatus();
+      if (IsDoneWell(*job) && !all) return absl::OkStatus();
       had_ended = IsFinal(job->stored.state);
     }
     // Reads every tile of the job: without the lock.
@@ -268,7 +268,7 @@ class CoordinatorImpl final : public Coordinator {
     FP_ASSIGN_OR_RETURN(const std::shared_ptr<Job> job, Find(id));
     StoredJob& stored = job->stored;
     const bool ended = IsFinal(stored.state);
-    if (!all && (stored.state == JobState::kDone || ended != had_ended)) return absl::OkStatus();
+    if (!all && (IsDoneWell(*job) || ended != had_ended)) return absl::OkStatus();
     if (!ended && !all) {
       scheduler_.ForgetFailures(id);
       JobLog(*job, {.text = "requeued: earlier failures are forgotten"});
@@ -284,6 +284,7 @@ class CoordinatorImpl final : public Coordinator {
         scheduler_.RemoveJob(id);
       }
       if (all) stored.fingerprint = {};
+      stored.suspect_tiles = 0;
       FP_ASSIGN_OR_RETURN(const std::vector<StoredTile> committed, store_->Tiles(id));
       ++job->changes;
       TakeUp(*job, committed);
@@ -474,6 +475,13 @@ class CoordinatorImpl final : public Coordinator {
     }
     std::lock_guard lock(mutex_);
     if (draining_) return Draining();
+    if (scheduler_.IsConvicted(hello)) {
+      return absl::FailedPreconditionError(
+          "worker '" + (hello.certified_as.empty() ? hello.name : hello.certified_as) +
+          "' returned wrong pixels and gets no tiles any more; test its memory and processor, then "
+          "restart the coordinator, which forgets it, or give the machine another " +
+          (hello.certified_as.empty() ? "--name" : "certificate"));
+    }
     WorkerWelcome welcome;
     welcome.id.value = RandomHex(16);
     welcome.heartbeat = options_.heartbeat;
@@ -517,6 +525,12 @@ class CoordinatorImpl final : public Coordinator {
       // Tiles become slow and workers come back from being set aside without a notification.
       work_.wait_until(lock, std::min(deadline, now + std::chrono::milliseconds(500)));
     }
+  }
+
+  uint64_t AwaitWork(uint64_t seen, std::chrono::milliseconds wait) override {
+    std::unique_lock lock(wakes_mutex_);
+    woken_.wait_for(lock, wait, [&] { return wakes_ != seen; });
+    return wakes_;
   }
 
   absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
@@ -569,9 +583,13 @@ class CoordinatorImpl final : public Coordinator {
     if (grant.audit) return ReturnAudit(grant, result);
     absl::Status stored =
         store_->CommitTile(grant.job, grant.tile, result, fingerprint, worker_name);
-    if (absl::IsAlreadyExists(stored)) stored = absl::OkStatus();
 
     std::unique_lock lock(mutex_);
+    // A commit that failed may have reached the disk all the same. But a row of a result that no
+    // longer counts is dropped, under this lock: whoever relies on one has to see it here.
+    if (absl::IsAlreadyExists(stored) && store_->HasTile(grant.job, grant.tile, result.sha256)) {
+      stored = absl::OkStatus();
+    }
     const bool counted = scheduler_.FinishCommit(result.lease, stored.ok(), result.sha256);
     bool more_work = !stored.ok();
     const auto at = jobs_.find(grant.job);
@@ -584,8 +602,10 @@ class CoordinatorImpl final : public Coordinator {
         FinishIfDone(job);
       } else if (!IsFinal(job.stored.state)) {
         // The job was taken up anew while this was stored, or the worker was found to return wrong
-        // pixels: the tile is queued.
-        stored = store_->DropTiles(grant.job, {grant.tile});
+        // pixels: the tile is queued, or was committed by another one since.
+        if (!scheduler_.IsCommitted(grant.job, grant.tile)) {
+          stored = store_->DropTiles(grant.job, {grant.tile});
+        }
         if (stored.ok()) stored = absl::FailedPreconditionError("the lease has ended meanwhile");
         more_work = true;
       }
@@ -698,6 +718,11 @@ class CoordinatorImpl final : public Coordinator {
   }
 
   void NotifyAll() {
+    {
+      std::lock_guard lock(wakes_mutex_);
+      ++wakes_;
+    }
+    woken_.notify_all();
     work_.notify_all();
     events_.notify_all();
     bakes_.notify_all();
@@ -712,11 +737,16 @@ class CoordinatorImpl final : public Coordinator {
     LogLease(LogLevel::kInfo, "audited", grant);
     const auto at = jobs_.find(grant.job);
     if (at != jobs_.end() && verdict.disputed) {
+      // Whoever takes the job up after a restart must not take the tile for a good one.
+      MarkSuspect(grant.job, grant.tile, true);
       JobLog(*at->second,
              {.level = LogLevel::kWarning,
               .text = "an audit gave other pixels than the tile has: another worker is asked",
               .tile = grant.tile,
               .worker = WorkerName(grant.worker)});
+    }
+    if (at != jobs_.end() && verdict.agreed && !verdict.convicted.empty()) {
+      MarkSuspect(grant.job, grant.tile, false);
     }
     for (const AuditVerdict::Convict& convict : verdict.convicted) {
       const std::string text =
@@ -733,6 +763,7 @@ class CoordinatorImpl final : public Coordinator {
     for (const auto& [id, tiles] : verdict.reopened) {
       if (const auto job = jobs_.find(id); job != jobs_.end()) Reopen(*job->second, tiles);
     }
+    for (const AuditVerdict::Convict& convict : verdict.convicted) SuspectDoneJobs(convict);
     if (at != jobs_.end()) FinishIfDone(*at->second);
     lock.unlock();
     NotifyAll();
@@ -740,6 +771,43 @@ class CoordinatorImpl final : public Coordinator {
   }
 
   // --- All below need mutex_ unless they say otherwise ---
+
+  // Nothing is left to be done for it, unless somebody asks for all tiles again.
+  static bool IsDoneWell(const Job& job) {
+    return job.stored.state == JobState::kDone && job.stored.suspect_tiles == 0;
+  }
+
+  void MarkSuspect(const JobId& job, uint32_t tile, bool suspect) {
+    const absl::Status marked = store_->MarkSuspect(job, tile, suspect);
+    if (!marked.ok()) Log(LogLevel::kError, "mark not stored: " + marked.ToString(), job);
+  }
+
+  // Jobs that are done keep what a worker returned that is convicted now: somebody has fetched the
+  // image. They are told apart, and a requeue renders those tiles again.
+  void SuspectDoneJobs(const AuditVerdict::Convict& convict) {
+    const bool certificate = !convict.certified_as.empty();
+    const absl::StatusOr<std::map<JobId, uint32_t>> marked =
+        store_->MarkSuspects(certificate ? convict.certified_as : convict.name, certificate);
+    if (!marked.ok()) {
+      Log(LogLevel::kError, "marks not stored: " + marked.status().ToString(), {});
+      return;
+    }
+    std::vector<JobLogLine> lines;
+    for (const auto& [id, count] : *marked) {
+      const auto at = jobs_.find(id);
+      if (at == jobs_.end()) continue;
+      at->second->stored.suspect_tiles += count;
+      lines.push_back(
+          {id,
+           {.level = LogLevel::kError,
+            .text = std::to_string(count) + " tiles of this job are of worker '" + convict.name +
+                    "', which was found to return wrong pixels since; `farpoint "
+                    "requeue` renders them again",
+            .worker = convict.name}});
+      Log(LogLevel::kError, lines.back().line.text, id);
+    }
+    AppendLogs(lines);
+  }
 
   // Committed tiles that are queued again: the scheduler knows already.
   void Reopen(Job& job, const std::vector<uint32_t>& tiles) {
@@ -782,6 +850,7 @@ class CoordinatorImpl final : public Coordinator {
     status.reissued = stored.reissued + scheduler_.Reissued(stored.id);
     status.refused_results = stored.refused_results + scheduler_.Refused(stored.id);
     status.after = stored.spec.after;
+    status.suspect_tiles = stored.suspect_tiles;
     status.frames = {.total = stored.spec.frame_count(),
                      .baked = static_cast<uint32_t>(stored.frames.size()),
                      .done = job.frames_done};
@@ -811,7 +880,7 @@ class CoordinatorImpl final : public Coordinator {
   void RememberCounters(Job& job) {
     job.stored.reissued += scheduler_.Reissued(job.stored.id);
     job.stored.refused_results += scheduler_.Refused(job.stored.id);
-    SaveCounters(job, job.stored.reissued, job.stored.refused_results);
+    SaveCounters({{job.stored.id, job.stored.reissued, job.stored.refused_results}});
   }
 
   // The store knows already.
@@ -824,6 +893,7 @@ class CoordinatorImpl final : public Coordinator {
     ++job.life;
     ++job.changes;
     RememberCounters(job);
+    saved_counters_.erase(id);
     scheduler_.RemoveJob(id);
     if (bake_in_work_ && bake_in_work_->job == id) *bake_in_work_->stop = true;
   }
@@ -915,26 +985,27 @@ class CoordinatorImpl final : public Coordinator {
     return absl::OkStatus();
   }
 
-  void SaveCounters(const Job& job, uint64_t reissued, uint64_t refused) {
-    const absl::Status saved = store_->SaveCounters(job.stored.id, reissued, refused);
-    if (!saved.ok()) {
-      Log(LogLevel::kError, "counters not saved: " + saved.ToString(), job.stored.id);
-    }
+  void SaveCounters(const std::vector<JobCounters>& counters) {
+    const absl::Status saved = store_->SaveCounters(counters);
+    if (!saved.ok()) Log(LogLevel::kError, "counters not saved: " + saved.ToString(), {});
   }
 
   void HandleNews(const SchedulerNews& news) {
+    // A switch that is restarted loses hundreds of leases at a time: one flush for all lines.
+    std::vector<JobLogLine> lines;
     for (const LostLease& lost : news.lost) {
       std::string text = "lease lost: " + lost.reason;
       if (lost.worker_set_aside) text += "; the worker is set aside for a while";
       LogLease(LogLevel::kWarning, text, lost.grant);
       if (const auto at = jobs_.find(lost.grant.job); at != jobs_.end()) {
-        JobLog(*at->second, {.level = LogLevel::kWarning,
-                             .text = text,
-                             .tile = lost.grant.tile,
-                             .attempt = lost.grant.attempt,
-                             .worker = lost.worker_name});
+        lines.push_back({lost.grant.job, Placed(*at->second, {.level = LogLevel::kWarning,
+                                                              .text = text,
+                                                              .tile = lost.grant.tile,
+                                                              .attempt = lost.grant.attempt,
+                                                              .worker = lost.worker_name})});
       }
     }
+    AppendLogs(lines);
     for (const SetAsideTile& poison : news.set_aside) {
       const auto at = jobs_.find(poison.job);
       if (at == jobs_.end() || IsFinal(at->second->stored.state)) continue;
@@ -1085,12 +1156,16 @@ class CoordinatorImpl final : public Coordinator {
         return;
       case AuditState::kUndecided: {
         const std::vector<uint32_t> disputed = scheduler_.DisputedTiles(id);
+        // First: a job that is failed with them would count them as good when it is requeued.
+        if (const absl::Status s = store_->DropTiles(id, disputed); !s.ok()) {
+          Log(LogLevel::kError, "disputed tiles not dropped: " + s.ToString(), id);
+          unfinished_.insert(id);
+          return;
+        }
+        unfinished_.erase(id);
         FailJob(job, UndecidedError(job, disputed));
         job.final_counts.committed -= static_cast<uint32_t>(disputed.size());
         job.final_counts.failed += static_cast<uint32_t>(disputed.size());
-        if (const absl::Status s = store_->DropTiles(id, disputed); !s.ok()) {
-          Log(LogLevel::kError, "disputed tiles not dropped: " + s.ToString(), id);
-        }
         return;
       }
       case AuditState::kNone:
@@ -1157,8 +1232,16 @@ class CoordinatorImpl final : public Coordinator {
       job->tiles = TilesOf(s.spec.film, static_cast<int>(s.spec.settings.tile_px));
     }
     jobs_.emplace(id, job);
-    FP_ASSIGN_OR_RETURN(std::vector<StoredTile> committed, store_->Tiles(id));
     const uint32_t total = job->total_tiles();
+    if (s.state == JobState::kDone) {
+      // All of its tiles are committed: weeks of done jobs are not read.
+      s.paused = false;
+      job->final_counts = FinalCounts(s.state, total, total);
+      job->committed.assign(s.spec.frame_count(), static_cast<uint32_t>(job->tiles.size()));
+      job->frames_done = s.spec.frame_count();
+      return absl::OkStatus();
+    }
+    FP_ASSIGN_OR_RETURN(std::vector<StoredTile> committed, store_->Tiles(id));
     if (IsFinal(s.state)) {
       s.paused = false;
       const uint32_t done = std::min(total, static_cast<uint32_t>(committed.size()));
@@ -1179,6 +1262,21 @@ class CoordinatorImpl final : public Coordinator {
     if (!damaged.empty()) {
       Log(LogLevel::kWarning,
           std::to_string(damaged.size()) + " tiles were damaged and are rendered again", id);
+    }
+    // The audits that were open died with the process.
+    std::vector<uint32_t> disputed;
+    for (const StoredTile& tile : committed) {
+      if (tile.suspect) disputed.push_back(tile.tile);
+    }
+    FP_RETURN_IF_ERROR(store_->DropTiles(id, disputed));
+    s.suspect_tiles = 0;
+    if (!disputed.empty()) {
+      Log(LogLevel::kWarning,
+          std::to_string(disputed.size()) +
+              " tiles about which workers disagreed are rendered again",
+          id);
+    }
+    if (!damaged.empty() || !disputed.empty()) {
       FP_ASSIGN_OR_RETURN(committed, store_->Tiles(id));
     }
     TakeUp(*job, committed);
@@ -1233,14 +1331,16 @@ class CoordinatorImpl final : public Coordinator {
       const auto now = std::chrono::steady_clock::now();
       if (now >= next_save) {
         next_save = now + std::chrono::seconds(5);
+        std::vector<JobCounters> counters;
         for (auto& [id, job] : jobs_) {
           if (!scheduler_.HasJob(id)) continue;
           const uint64_t reissued = job->stored.reissued + scheduler_.Reissued(id);
           const uint64_t refused = job->stored.refused_results + scheduler_.Refused(id);
           if (std::exchange(saved_counters_[id], reissued + refused) != reissued + refused) {
-            SaveCounters(*job, reissued, refused);
+            counters.push_back({id, reissued, refused});
           }
         }
+        SaveCounters(counters);
       }
       if (now >= next_purge) {
         next_purge = now + std::chrono::hours(1);
@@ -1433,15 +1533,23 @@ class CoordinatorImpl final : public Coordinator {
   }
 
   // Into the log that belongs to the job.
-  void JobLog(Job& job, LogLine line) {
+  void JobLog(Job& job, const LogLine& line) { AppendLogs({{job.stored.id, Placed(job, line)}}); }
+  // With the frame of its tile.
+  static LogLine Placed(const Job& job, LogLine line) {
     if (line.tile && !job.stored.spec.frames.empty()) {
       line.text = FrameName(job, job.frame_of(*line.tile)) + ": " + line.text;
     }
-    const absl::StatusOr<bool> written = store_->AppendLog(job.stored.id, line);
+    return line;
+  }
+  void AppendLogs(const std::vector<JobLogLine>& lines) {
+    const absl::StatusOr<std::vector<bool>> written = store_->AppendLogs(lines);
     if (!written.ok()) {
-      Log(LogLevel::kError, "log not stored: " + written.status().ToString(), job.stored.id);
-    } else if (*written) {
-      ++job.changes;
+      Log(LogLevel::kError, "log not stored: " + written.status().ToString(), lines.front().job);
+      return;
+    }
+    for (size_t i = 0; i < lines.size(); ++i) {
+      if (!(*written)[i]) continue;
+      if (const auto at = jobs_.find(lines[i].job); at != jobs_.end()) ++at->second->changes;
     }
   }
 
@@ -1482,6 +1590,9 @@ class CoordinatorImpl final : public Coordinator {
   // No tile is left, but audits or workers that may come back; guarded by mutex_.
   std::set<JobId> unfinished_;
   bool draining_ = false, stopping_ = false;  // guarded by mutex_
+  std::mutex wakes_mutex_;                    // after mutex_
+  std::condition_variable woken_;
+  uint64_t wakes_ = 1;  // guarded by wakes_mutex_
   std::thread ticker_, bakery_;
 };
 

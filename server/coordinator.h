@@ -135,6 +135,9 @@ class CoordinatorApi {
   // Waits up to `wait` for a tile. kNotFound: register again.
   virtual absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                         std::chrono::milliseconds wait) = 0;
+  // For one thread that asks for many workers, by Lease without a wait: returns when something has
+  // changed since it returned `seen` (0: at first), after `wait`, or when the coordinator ends.
+  virtual uint64_t AwaitWork(uint64_t seen, std::chrono::milliseconds wait) = 0;
   virtual absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
                                             const LeaseProgress& progress) = 0;
   // When it answers `accepted`, the tile is durable. A refusal (lease lost, another copy was

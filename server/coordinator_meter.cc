@@ -236,6 +236,10 @@ absl::StatusOr<std::optional<TileWork>> CoordinatorMeter::Lease(const WorkerId& 
   }
   return work;
 }
+uint64_t CoordinatorMeter::AwaitWork(uint64_t seen, std::chrono::milliseconds wait) {
+  return coordinator_.AwaitWork(seen, wait);
+}
+
 absl::StatusOr<RenewAnswer> CoordinatorMeter::Renew(const WorkerId& worker, const LeaseId& lease,
                                                     const LeaseProgress& progress) {
   return coordinator_.Renew(worker, lease, progress);

@@ -75,6 +75,7 @@ class CoordinatorMeter : public CoordinatorApi {
   absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) override;
   absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                 std::chrono::milliseconds wait) override;
+  uint64_t AwaitWork(uint64_t seen, std::chrono::milliseconds wait) override;
   absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
                                     const LeaseProgress& progress) override;
   absl::StatusOr<ReturnAnswer> Return(const WorkerId& worker, const TileResult& result) override;

@@ -83,6 +83,11 @@ void ExplainState(const ExplanationFacts& facts, std::vector<std::string>& lines
             " frames done, " + std::to_string(s.frames.baked) + " baked";
   }
   lines.push_back(line + "; priority " + std::to_string(s.priority));
+  if (s.suspect_tiles > 0) {
+    lines.push_back(Count(s.suspect_tiles, "tile is", "tiles are") +
+                    " of a worker that was found to return wrong pixels since: farpoint requeue " +
+                    s.id.value + " renders them again");
+  }
   if (!s.error.ok()) lines.push_back("it failed: " + std::string(s.error.message()));
   if (s.state == JobState::kFailed || s.state == JobState::kCancelled) {
     lines.push_back("farpoint requeue " + s.id.value + " goes on where it was");

@@ -175,7 +175,7 @@ class GrpcServerImpl final : public GrpcServer {
     };
     blobs_ = MakeBlobService(coordinator_, access_);
     jobs_ = MakeJobService(coordinator_, access_);
-    workers_ = MakeWorkerService(coordinator_);
+    workers_ = MakeWorkerService(coordinator_, access_);
     return absl::OkStatus();
   }
 

@@ -37,6 +37,7 @@ std::unique_ptr<grpc::Service> MakeBlobService(CoordinatorApi& coordinator,
                                                const ServiceAccess& access);
 std::unique_ptr<grpc::Service> MakeJobService(CoordinatorApi& coordinator,
                                               const ServiceAccess& access);
-std::unique_ptr<grpc::Service> MakeWorkerService(CoordinatorApi& coordinator);
+std::unique_ptr<grpc::Service> MakeWorkerService(CoordinatorApi& coordinator,
+                                                 const ServiceAccess& access);
 
 }  // namespace farpoint

@@ -29,7 +29,7 @@ namespace fs = std::filesystem;
 
 namespace {
 
-constexpr int kSchemaVersion = 3;
+constexpr int kSchemaVersion = 4;
 constexpr const char* kSchema = R"sql(
 CREATE TABLE jobs (
   number INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -62,7 +62,9 @@ CREATE TABLE tiles (
   segment INTEGER,
   offset INTEGER,
   worker TEXT NOT NULL DEFAULT '',
+  suspect INTEGER NOT NULL DEFAULT 0,
   PRIMARY KEY (job, tile)) WITHOUT ROWID;
+CREATE INDEX suspects ON tiles(job) WHERE suspect != 0;
 CREATE TABLE events (
   job INTEGER NOT NULL REFERENCES jobs(number) ON DELETE CASCADE,
   sequence INTEGER NOT NULL,
@@ -96,6 +98,10 @@ ALTER TABLE events ADD COLUMN unix_ms INTEGER NOT NULL DEFAULT 0;
 ALTER TABLE tiles ADD COLUMN segment INTEGER;
 ALTER TABLE tiles ADD COLUMN offset INTEGER;
 ALTER TABLE tiles ADD COLUMN worker TEXT NOT NULL DEFAULT '';
+)sql",
+                                       R"sql(
+ALTER TABLE tiles ADD COLUMN suspect INTEGER NOT NULL DEFAULT 0;
+CREATE INDEX suspects ON tiles(job) WHERE suspect != 0;
 )sql"};
 static_assert(std::size(kMigrations) == kSchemaVersion - 1);
 
@@ -223,11 +229,22 @@ class Statement {
 class SqliteJobStore final : public JobStore {
  public:
   ~SqliteJobStore() override {
+    sqlite3_close(read_db_);
     sqlite3_close(db_);
     if (lock_fd_ >= 0) ::close(lock_fd_);
   }
 
   absl::Status Init(const std::string& directory, StoreHook hook) {
+    FP_RETURN_IF_ERROR(InitWriter(directory, std::move(hook)));
+    if (in_memory()) return absl::OkStatus();
+    if (sqlite3_open_v2(path_.c_str(), &read_db_, SQLITE_OPEN_READONLY | SQLITE_OPEN_FULLMUTEX,
+                        nullptr) != SQLITE_OK) {
+      return SqlError(read_db_, path_);
+    }
+    return absl::OkStatus();
+  }
+
+  absl::Status InitWriter(const std::string& directory, StoreHook hook) {
     directory_ = directory;
     hook_ = std::move(hook);
     path_ = in_memory() ? ":memory:" : directory + "/jobs.sqlite";
@@ -289,6 +306,16 @@ class SqliteJobStore final : public JobStore {
 
   absl::StatusOr<std::vector<StoredJob>> LoadJobs() override {
     std::lock_guard lock(mutex_);
+    std::map<int64_t, uint32_t> suspects;  // by job
+    {
+      Statement query(db_, path_,
+                      "SELECT job, COUNT(*) FROM tiles WHERE suspect != 0 GROUP BY job");
+      for (;;) {
+        FP_ASSIGN_OR_RETURN(const bool row, query.Step());
+        if (!row) break;
+        suspects[query.GetInt(0)] = static_cast<uint32_t>(query.GetInt(1));
+      }
+    }
     std::vector<StoredJob> jobs;
     Statement query(db_, path_,
                     "SELECT number, id, spec, state, error_code, error, submitted_ms, paused, "
@@ -298,6 +325,9 @@ class SqliteJobStore final : public JobStore {
       if (!row) return jobs;
       StoredJob job;
       job.number = static_cast<uint64_t>(query.GetInt(0));
+      if (const auto at = suspects.find(query.GetInt(0)); at != suspects.end()) {
+        job.suspect_tiles = at->second;
+      }
       job.id.value = query.GetBytes(1);
       job.state = StateFromInt(query.GetInt(3), JobState::kCancelled);
       job.error = absl::Status(static_cast<absl::StatusCode>(query.GetInt(4)), query.GetBytes(5));
@@ -379,11 +409,11 @@ class SqliteJobStore final : public JobStore {
   }
 
   absl::StatusOr<Stats> BakeStats(const JobId& job) override {
-    std::lock_guard lock(mutex_);
-    return SumStats(
-        "SELECT stats FROM frames WHERE job = (SELECT number FROM jobs WHERE id = ?) "
-        "ORDER BY frame",
-        job);
+    const Reading reading = Read();
+    return SumStats(reading.db,
+                    "SELECT stats FROM frames WHERE job = (SELECT number FROM jobs WHERE id = ?) "
+                    "ORDER BY frame",
+                    job);
   }
 
   absl::Status SetPaused(const JobId& job, bool paused) override {
@@ -415,7 +445,12 @@ class SqliteJobStore final : public JobStore {
     Transaction transaction(*this);
     FP_RETURN_IF_ERROR(transaction.Begin());
     FP_ASSIGN_OR_RETURN(const JobState now, StateOf(job));
-    if (all) {
+    if (!all) {
+      Statement remove(db_, path_,
+                       "DELETE FROM tiles WHERE suspect != 0 AND "
+                       "job = (SELECT number FROM jobs WHERE id = ?)");
+      FP_RETURN_IF_ERROR(remove.Text(job.value).Run());
+    } else {
       Statement remove(db_, path_,
                        "DELETE FROM tiles WHERE job = (SELECT number FROM jobs WHERE id = ?)");
       FP_RETURN_IF_ERROR(remove.Text(job.value).Run());
@@ -438,12 +473,20 @@ class SqliteJobStore final : public JobStore {
     return absl::OkStatus();
   }
 
-  absl::Status SaveCounters(const JobId& job, uint64_t reissued, uint64_t refused) override {
+  absl::Status SaveCounters(const std::vector<JobCounters>& counters) override {
+    if (counters.empty()) return absl::OkStatus();
     std::lock_guard lock(mutex_);
+    Transaction transaction(*this);
+    FP_RETURN_IF_ERROR(transaction.Begin());
     Statement update(db_, path_, "UPDATE jobs SET reissued = ?, refused = ? WHERE id = ?");
-    return RunAlone(update.Int(static_cast<int64_t>(reissued))
-                        .Int(static_cast<int64_t>(refused))
-                        .Text(job.value));
+    for (const JobCounters& one : counters) {
+      FP_RETURN_IF_ERROR(update.Reset()
+                             .Int(static_cast<int64_t>(one.reissued))
+                             .Int(static_cast<int64_t>(one.refused))
+                             .Text(one.job.value)
+                             .Run());
+    }
+    return transaction.Commit();
   }
 
   absl::Status CommitTile(const JobId& job, uint32_t tile, const TileResult& result,
@@ -478,23 +521,32 @@ class SqliteJobStore final : public JobStore {
   }
 
   absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) override {
-    std::lock_guard lock(mutex_);
-    return TilesLocked(job);
+    const Reading reading = Read();
+    return TilesOf(reading.db, job);
+  }
+
+  bool HasTile(const JobId& job, uint32_t tile, const Digest& sha256) override {
+    const Reading reading = Read();
+    Statement query(reading.db, path_,
+                    "SELECT 1 FROM tiles WHERE tile = ? AND sha256 = ? AND job = "
+                    "(SELECT number FROM jobs WHERE id = ?)");
+    const absl::StatusOr<bool> row = query.Int(tile).Hash(sha256).Text(job.value).Step();
+    return row.ok() && *row;
   }
 
   absl::StatusOr<Stats> TileStats(const JobId& job) override {
-    std::lock_guard lock(mutex_);
-    return SumStats(
-        "SELECT stats FROM tiles WHERE job = (SELECT number FROM jobs WHERE id = ?) "
-        "ORDER BY tile",
-        job);
+    const Reading reading = Read();
+    return SumStats(reading.db,
+                    "SELECT stats FROM tiles WHERE job = (SELECT number FROM jobs WHERE id = ?) "
+                    "ORDER BY tile",
+                    job);
   }
 
   absl::StatusOr<std::vector<StoredTileStats>> TileStatsOf(const JobId& job, uint32_t first,
                                                            uint32_t count) override {
-    std::lock_guard lock(mutex_);
+    const Reading reading = Read();
     std::vector<StoredTileStats> tiles;
-    Statement query(db_, path_,
+    Statement query(reading.db, path_,
                     "SELECT tile, worker, stats FROM tiles WHERE job = "
                     "(SELECT number FROM jobs WHERE id = ?) AND tile >= ? AND tile < ? "
                     "ORDER BY tile");
@@ -510,9 +562,9 @@ class SqliteJobStore final : public JobStore {
   }
 
   absl::StatusOr<std::vector<TileSeconds>> SlowestTiles(const JobId& job, size_t count) override {
-    std::lock_guard lock(mutex_);
+    const Reading reading = Read();
     std::vector<TileSeconds> slowest;
-    Statement query(db_, path_,
+    Statement query(reading.db, path_,
                     "SELECT tile, stats FROM tiles WHERE job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY tile");
     query.Text(job.value);
@@ -537,8 +589,8 @@ class SqliteJobStore final : public JobStore {
     std::string path = TilePath(job, tile);
     bool own_file = true;
     {
-      std::lock_guard lock(mutex_);
-      Statement query(db_, path_,
+      const Reading reading = Read();
+      Statement query(reading.db, path_,
                       "SELECT sha256, size, segment, offset FROM tiles WHERE tile = ? AND job = "
                       "(SELECT number FROM jobs WHERE id = ?)");
       FP_ASSIGN_OR_RETURN(const bool row, query.Int(tile).Text(job.value).Step());
@@ -613,9 +665,9 @@ class SqliteJobStore final : public JobStore {
 
   absl::StatusOr<std::vector<StoredEvent>> Events(const JobId& job, uint64_t after,
                                                   uint32_t max) override {
-    std::lock_guard lock(mutex_);
+    const Reading reading = Read();
     std::vector<StoredEvent> events;
-    Statement query(db_, path_,
+    Statement query(reading.db, path_,
                     "SELECT sequence, kind, number, data, unix_ms FROM events "
                     "WHERE sequence > ? AND job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY sequence LIMIT ?");
@@ -628,36 +680,71 @@ class SqliteJobStore final : public JobStore {
     }
   }
 
-  absl::StatusOr<bool> AppendLog(const JobId& job, const LogLine& line) override {
+  absl::StatusOr<std::vector<bool>> AppendLogs(const std::vector<JobLogLine>& lines) override {
+    std::vector<bool> added;
+    if (lines.empty()) return added;
     std::lock_guard lock(mutex_);
-    auto at = log_lines_.find(job);
-    if (at == log_lines_.end()) {
-      Statement query(db_, path_,
-                      "SELECT COUNT(*) FROM events WHERE kind = ? AND job = "
-                      "(SELECT number FROM jobs WHERE id = ?)");
-      FP_RETURN_IF_ERROR(query.Int(kLogEvent).Text(job.value).Step().status());
-      at = log_lines_.emplace(job, query.GetInt(0)).first;
+    const std::map<JobId, int64_t> before = log_lines_;
+    const absl::Status status = [&]() -> absl::Status {
+      Transaction transaction(*this);
+      FP_RETURN_IF_ERROR(transaction.Begin());
+      for (const JobLogLine& one : lines) {
+        FP_ASSIGN_OR_RETURN(const bool taken, AddLogLine(one.job, one.line));
+        added.push_back(taken);
+      }
+      return transaction.Commit();
+    }();
+    if (status.ok()) return added;
+    log_lines_ = before;
+    return status;
+  }
+
+  absl::Status MarkSuspect(const JobId& job, uint32_t tile, bool suspect) override {
+    std::lock_guard lock(mutex_);
+    Statement update(db_, path_,
+                     "UPDATE tiles SET suspect = ? WHERE tile = ? AND job = "
+                     "(SELECT number FROM jobs WHERE id = ?)");
+    return RunAlone(update.Int(suspect ? 1 : 0).Int(tile).Text(job.value));
+  }
+
+  absl::StatusOr<std::map<JobId, uint32_t>> MarkSuspects(const std::string& worker,
+                                                         bool certificate) override {
+    std::lock_guard lock(mutex_);
+    std::map<JobId, uint32_t> marked;
+    Transaction transaction(*this);
+    FP_RETURN_IF_ERROR(transaction.Begin());
+    // By the job, of which there are few that have ended, not by a scan of all tiles.
+    std::vector<std::pair<int64_t, JobId>> jobs;
+    {
+      Statement query(db_, path_, "SELECT number, id FROM jobs WHERE state = ?");
+      query.Int(static_cast<int64_t>(JobState::kDone));
+      for (;;) {
+        FP_ASSIGN_OR_RETURN(const bool row, query.Step());
+        if (!row) break;
+        jobs.emplace_back(query.GetInt(0), JobId{query.GetBytes(1)});
+      }
     }
-    if (at->second > kMaxLogLines) return false;
-    LogLine last;
-    last.level = LogLevel::kWarning;
-    last.text = "more than " + std::to_string(kMaxLogLines) +
-                " lines: what happens from here on stands in the coordinator's log only";
-    const bool full = at->second == kMaxLogLines;
-    const LogLine& written = full ? last : line;
-    At("before a line of the log");
-    FP_RETURN_IF_ERROR(AddEvent(job, kLogEvent, static_cast<int64_t>(written.level),
-                                ToWire(written).SerializeAsString()));
-    At("after a line of the log");
-    ++at->second;
-    return true;
+    // Names of certified workers begin with the certificate's.
+    Statement update(
+        db_, path_,
+        "UPDATE tiles SET suspect = 1 WHERE job = ? AND suspect = 0 AND (worker = ? OR "
+        "(? AND substr(worker, 1, length(?) + 1) = ? || '/'))");
+    for (const auto& [number, id] : jobs) {
+      update.Reset().Int(number).Text(worker).Int(certificate ? 1 : 0).Text(worker).Text(worker);
+      FP_RETURN_IF_ERROR(update.Run());
+      if (const int count = sqlite3_changes(db_); count > 0) {
+        marked[id] = static_cast<uint32_t>(count);
+      }
+    }
+    FP_RETURN_IF_ERROR(transaction.Commit());
+    return marked;
   }
 
   absl::StatusOr<std::vector<StoredEvent>> LastLogLines(const JobId& job, LogLevel level,
                                                         uint32_t max) override {
-    std::lock_guard lock(mutex_);
+    const Reading reading = Read();
     std::vector<StoredEvent> events;
-    Statement query(db_, path_,
+    Statement query(reading.db, path_,
                     "SELECT sequence, kind, number, data, unix_ms FROM events "
                     "WHERE kind = ? AND number >= ? AND job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY sequence DESC LIMIT ?");
@@ -781,6 +868,30 @@ class SqliteJobStore final : public JobStore {
   void At(std::string_view point) const {
     if (hook_) hook_(point);
   }
+  // Within a transaction.
+  absl::StatusOr<bool> AddLogLine(const JobId& job, const LogLine& line) {
+    auto at = log_lines_.find(job);
+    if (at == log_lines_.end()) {
+      Statement query(db_, path_,
+                      "SELECT COUNT(*) FROM events WHERE kind = ? AND job = "
+                      "(SELECT number FROM jobs WHERE id = ?)");
+      FP_RETURN_IF_ERROR(query.Int(kLogEvent).Text(job.value).Step().status());
+      at = log_lines_.emplace(job, query.GetInt(0)).first;
+    }
+    if (at->second > kMaxLogLines) return false;
+    LogLine last;
+    last.level = LogLevel::kWarning;
+    last.text = "more than " + std::to_string(kMaxLogLines) +
+                " lines: what happens from here on stands in the coordinator's log only";
+    const bool full = at->second == kMaxLogLines;
+    const LogLine& written = full ? last : line;
+    At("before a line of the log");
+    FP_RETURN_IF_ERROR(AddEvent(job, kLogEvent, static_cast<int64_t>(written.level),
+                                ToWire(written).SerializeAsString()));
+    At("after a line of the log");
+    ++at->second;
+    return true;
+  }
   // A change that is a transaction of its own.
   absl::Status RunAlone(Statement& statement) {
     At("before a statement");
@@ -790,6 +901,16 @@ class SqliteJobStore final : public JobStore {
   }
 
   bool in_memory() const { return directory_.empty(); }
+
+  // For those who only read: they neither wait for the disk of those who write nor hold them up.
+  struct Reading {
+    std::unique_lock<std::mutex> lock;
+    sqlite3* db;
+  };
+  Reading Read() {
+    if (in_memory()) return {std::unique_lock(mutex_), db_};
+    return {std::unique_lock(read_mutex_), read_db_};
+  }
   std::string SegmentPath(const JobId& job, int64_t number) const {
     return TileFolder(job) + "/segment." + std::to_string(number);
   }
@@ -849,9 +970,9 @@ class SqliteJobStore final : public JobStore {
     return StatsFromWire(wire);
   }
   // `sql` selects the statistics of the job whose id is its one parameter.
-  absl::StatusOr<Stats> SumStats(const char* sql, const JobId& job) {
+  absl::StatusOr<Stats> SumStats(sqlite3* db, const char* sql, const JobId& job) const {
     Stats sum;
-    Statement query(db_, path_, sql);
+    Statement query(db, path_, sql);
     query.Text(job.value);
     for (;;) {
       FP_ASSIGN_OR_RETURN(const bool row, query.Step());
@@ -1036,7 +1157,8 @@ class SqliteJobStore final : public JobStore {
         if (!row) return Unknown(one->job);
         at = numbers.emplace(one->job, Numbers{query.GetInt(0), query.GetInt(1)}).first;
         Statement first(db_, path_,
-                        "UPDATE jobs SET fingerprint = ? WHERE number = ? AND fingerprint IS NULL");
+                        "UPDATE jobs SET fingerprint = ?1 WHERE number = ?2 AND (fingerprint IS "
+                        "NULL OR NOT EXISTS (SELECT 1 FROM tiles WHERE job = ?2))");
         FP_RETURN_IF_ERROR(first.Hash(one->fingerprint).Int(at->second.job).Run());
       }
       const Digest& sha256 = one->result.sha256;
@@ -1095,8 +1217,8 @@ class SqliteJobStore final : public JobStore {
   absl::StatusOr<std::vector<uint32_t>> TilesWithoutBytes(const JobId& job) {
     std::vector<uint32_t> missing;
     if (in_memory()) return missing;
-    std::lock_guard lock(mutex_);
-    Statement query(db_, path_,
+    const Reading reading = Read();
+    Statement query(reading.db, path_,
                     "SELECT tile, size, segment, offset FROM tiles WHERE job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY tile");
     query.Text(job.value);
@@ -1189,10 +1311,10 @@ class SqliteJobStore final : public JobStore {
                                     " is committed already");
   }
 
-  absl::StatusOr<std::vector<StoredTile>> TilesLocked(const JobId& job) {
+  absl::StatusOr<std::vector<StoredTile>> TilesOf(sqlite3* db, const JobId& job) const {
     std::vector<StoredTile> tiles;
-    Statement query(db_, path_,
-                    "SELECT tile, sha256, size, worker FROM tiles WHERE job = "
+    Statement query(db, path_,
+                    "SELECT tile, sha256, size, worker, suspect FROM tiles WHERE job = "
                     "(SELECT number FROM jobs WHERE id = ?) ORDER BY tile");
     query.Text(job.value);
     for (;;) {
@@ -1203,6 +1325,7 @@ class SqliteJobStore final : public JobStore {
       FP_ASSIGN_OR_RETURN(tile.sha256, query.GetHash(1));
       tile.size_bytes = static_cast<uint64_t>(query.GetInt(2));
       tile.worker = query.GetBytes(3);
+      tile.suspect = query.GetInt(4) != 0;
       tiles.push_back(std::move(tile));
     }
   }
@@ -1211,6 +1334,8 @@ class SqliteJobStore final : public JobStore {
   StoreHook hook_;
   int lock_fd_ = -1;
   sqlite3* db_ = nullptr;
+  std::mutex read_mutex_;
+  sqlite3* read_db_ = nullptr;  // guarded by read_mutex_; null: in memory
 
   std::mutex queue_mutex_;
   std::deque<PendingTile*> queue_;     // guarded by queue_mutex_

@@ -62,6 +62,16 @@ struct StoredJob {
   // From the first committed tile on.
   Digest fingerprint;
   uint64_t reissued = 0, refused_results = 0;
+  uint32_t suspect_tiles = 0;
+};
+
+struct JobCounters {
+  JobId job;
+  uint64_t reissued = 0, refused = 0;
+};
+struct JobLogLine {
+  JobId job;
+  LogLine line;
 };
 
 struct StoredTile {
@@ -69,6 +79,7 @@ struct StoredTile {
   Digest sha256;
   uint64_t size_bytes = 0;
   std::string worker;  // name of who rendered it; may be empty
+  bool suspect = false;
 };
 
 // Thread-seconds that a committed tile took, all stages together.
@@ -120,10 +131,10 @@ class JobStore {
   virtual absl::Status SetPaused(const JobId& job, bool paused) = 0;
   virtual absl::Status SetPriority(const JobId& job, int32_t priority) = 0;
   // A job that has ended is kRendering again if a frame was baked, else kQueued, not paused and
-  // without error; with its event. `all`: its committed tiles are dropped, also those of a job that
-  // has not ended, whose state stays.
+  // without error; with its event. Suspect tiles are dropped; `all`: all committed tiles, also
+  // those of a job that has not ended, whose state stays.
   virtual absl::Status Requeue(const JobId& job, bool all) = 0;
-  virtual absl::Status SaveCounters(const JobId& job, uint64_t reissued, uint64_t refused) = 0;
+  virtual absl::Status SaveCounters(const std::vector<JobCounters>& counters) = 0;
 
   // --- Tiles ---
   // The bytes, the row, the event, and the job's fingerprint if it had none. kAlreadyExists if the
@@ -131,6 +142,8 @@ class JobStore {
   virtual absl::Status CommitTile(const JobId& job, uint32_t tile, const TileResult& result,
                                   const Digest& fingerprint, const std::string& worker = "") = 0;
   virtual absl::StatusOr<std::vector<StoredTile>> Tiles(const JobId& job) = 0;  // ascending
+  // Whether the tile is committed with these bytes; false, too, if the store cannot be read.
+  virtual bool HasTile(const JobId& job, uint32_t tile, const Digest& sha256) = 0;
   // Added in tile order.
   virtual absl::StatusOr<Stats> TileStats(const JobId& job) = 0;
   // Of the committed tiles of [first, first + count), ascending.
@@ -144,6 +157,13 @@ class JobStore {
       const JobId& job, uint64_t read_bytes = UINT64_MAX) = 0;
   // It is as if they had never been committed.
   virtual absl::Status DropTiles(const JobId& job, const std::vector<uint32_t>& tiles) = 0;
+  // Suspect tiles are those about which workers disagree, and those of a worker that was found to
+  // return wrong pixels after their job was done. A mark on a tile that is not committed is none.
+  virtual absl::Status MarkSuspect(const JobId& job, uint32_t tile, bool suspect) = 0;
+  // All tiles of jobs that are done which `worker` committed, by its name; `certificate`: `worker`
+  // and whoever's name begins with it and a slash. Returns how many of which job are new.
+  virtual absl::StatusOr<std::map<JobId, uint32_t>> MarkSuspects(const std::string& worker,
+                                                                 bool certificate) = 0;
   // The `count` committed tiles that took the longest, the longest first.
   virtual absl::StatusOr<std::vector<TileSeconds>> SlowestTiles(const JobId& job, size_t count) = 0;
 
@@ -151,9 +171,13 @@ class JobStore {
   virtual absl::StatusOr<std::vector<StoredEvent>> Events(const JobId& job, uint64_t after,
                                                           uint32_t max) = 0;
 
-  // Adds an event. False if the job has its kMaxLogLines already: then it is dropped; the first one
-  // that is dropped leaves a line that says so.
-  virtual absl::StatusOr<bool> AppendLog(const JobId& job, const LogLine& line) = 0;
+  // Adds an event for each, in order, with one flush for all. False if the job has its kMaxLogLines
+  // already: then it is dropped; the first one that is dropped leaves a line that says so.
+  virtual absl::StatusOr<std::vector<bool>> AppendLogs(const std::vector<JobLogLine>& lines) = 0;
+  absl::StatusOr<bool> AppendLog(const JobId& job, const LogLine& line) {
+    FP_ASSIGN_OR_RETURN(const std::vector<bool> added, AppendLogs({{job, line}}));
+    return added.front();
+  }
   // The last lines of at least `level`, at most `max`, in order.
   virtual absl::StatusOr<std::vector<StoredEvent>> LastLogLines(const JobId& job, LogLevel level,
                                                                 uint32_t max) = 0;

@@ -16,6 +16,9 @@ constexpr size_t kDurationsForSlowness = 4;
 // A worker so much slower than the one that asks gives up its tile to it.
 constexpr double kMuchSlower = 2;
 constexpr Duration kWorthCopying = std::chrono::milliseconds(200);
+// For each lease of a job that is looked at: some hundred times what that takes.
+constexpr Duration kCopySearch = std::chrono::microseconds(20);
+constexpr size_t kManyLeases = 64;
 // How long a vanished worker counts as a sign that the farm, not a tile, is at fault.
 constexpr Duration kStormWindow = std::chrono::minutes(10);
 constexpr size_t kStormFactor = 3;
@@ -43,9 +46,19 @@ bool IsPermanent(absl::StatusCode code) {
 
 }  // namespace
 
-bool TileScheduler::Audit::HasOpinionOf(const WorkerId& worker) const {
-  return std::any_of(opinions.begin(), opinions.end(),
-                     [&](const auto& opinion) { return opinion.second.contains(worker); });
+bool TileScheduler::Audit::HasOpinionOf(const std::string& owner) const {
+  for (const auto& [digest, workers] : opinions) {
+    for (const auto& [id, hello] : workers) {
+      if (OwnerOf(hello) == owner) return true;
+    }
+  }
+  return false;
+}
+
+// Names of certified workers begin with the certificate's.
+bool TileScheduler::IsOf(const std::string& name, const WorkerHello& owner) {
+  if (owner.certified_as.empty()) return name == owner.name;
+  return name == owner.certified_as || name.starts_with(owner.certified_as + "/");
 }
 
 bool TileScheduler::Rank::operator<(const Rank& other) const {
@@ -153,6 +166,7 @@ void TileScheduler::ForgetFailures(const JobId& id) {
     if (tile.state == TileState::kFailed) SetState(job, i, TileState::kQueued);
   }
   job.causes.clear();
+  job.permanent.clear();
 }
 
 TileCounts TileScheduler::Counts(const JobId& id) const {
@@ -250,6 +264,12 @@ bool TileScheduler::MayGiveUp(const JobId& id) const {
   return at == jobs_.end() || clock_.Now() >= at->second.comeback_until;
 }
 
+bool TileScheduler::IsCommitted(const JobId& id, uint32_t tile) const {
+  const auto at = jobs_.find(id);
+  return at != jobs_.end() && tile < at->second.tiles.size() &&
+         at->second.tiles[tile].state == TileState::kCommitted;
+}
+
 std::vector<uint32_t> TileScheduler::DisputedTiles(const JobId& id) const {
   std::vector<uint32_t> tiles;
   const auto at = jobs_.find(id);
@@ -316,6 +336,17 @@ void TileScheduler::AddWorker(const WorkerId& id, const WorkerHello& hello) {
   Worker worker;
   worker.hello = hello;
   worker.heard = clock_.Now();
+  worker.convicted = IsConvicted(hello);
+  const std::string name = hello.name.empty() ? id.value : hello.name;
+  worker.hello.name = name;
+  const auto taken = [&] {
+    return std::any_of(workers_.begin(), workers_.end(), [&](const auto& other) {
+      return other.second.hello.name == worker.hello.name && IsThere(other.second);
+    });
+  };
+  for (int number = 2; taken(); ++number) {
+    worker.hello.name = name + "#" + std::to_string(number);
+  }
   workers_.emplace(id, std::move(worker));
 }
 
@@ -440,7 +471,7 @@ bool TileScheduler::AnotherWorkerCouldTake(const Job& job, const Tile& tile,
 
 bool TileScheduler::SomeWorkerCouldAudit(const Job& job, const Audit& audit) const {
   for (const auto& [id, worker] : workers_) {
-    if (IsSetAside(worker) || audit.HasOpinionOf(id)) continue;
+    if (IsSetAside(worker) || audit.HasOpinionOf(OwnerOf(worker.hello))) continue;
     if (TakesFingerprint(job, worker) && IsThere(worker)) return true;
   }
   return false;
@@ -546,11 +577,12 @@ std::optional<uint32_t> TileScheduler::PickTile(Job& job, const WorkerId& id) {
 }
 
 std::optional<LeaseGrant> TileScheduler::LeaseAudit(const WorkerId& id, const Worker& worker) {
+  const std::string owner = OwnerOf(worker.hello);
   for (const Rank& rank : auditing_) {
     Job& job = jobs_.at(rank.id);
     if (!TakesFingerprint(job, worker)) continue;
     for (const auto& [tile, audit] : job.audits) {
-      if (!audit.lease && !audit.HasOpinionOf(id)) return Grant(id, job, tile, false, true);
+      if (!audit.lease && !audit.HasOpinionOf(owner)) return Grant(id, job, tile, false, true);
     }
   }
   return std::nullopt;
@@ -562,6 +594,12 @@ std::optional<LeaseGrant> TileScheduler::LeaseCopy(const WorkerId& id, const Wor
   for (const Rank& rank : working_) {
     Job& job = jobs_.at(rank.id);
     if (!TakesFingerprint(job, worker) || job.durations.empty()) continue;
+    // Hundreds of idle workers ask several times a second, and each would look at hundreds of
+    // leases.
+    if (job.leases.size() >= kManyLeases) {
+      if (now < job.copies_after) continue;
+      job.copies_after = now + kCopySearch * job.leases.size();
+    }
     const Duration slow =
         std::max(options_.speculate_after,
                  std::chrono::duration_cast<Duration>(job.median * options_.speculate_factor));
@@ -697,7 +735,10 @@ bool TileScheduler::FinishCommit(const LeaseId& lease, bool durable, const Diges
   if (options_.audit_fraction > 0 &&
       std::uniform_real_distribution<double>(0, 1)(random_) < options_.audit_fraction) {
     Audit audit;
-    audit.opinions[result].emplace(live.grant.worker, name);
+    WorkerHello hello = by == workers_.end() ? WorkerHello{} : by->second.hello;
+    hello.name = name;
+    audit.opinions[result].emplace(live.grant.worker, std::move(hello));
+    audit.committed = result;
     job.audits[live.grant.tile] = std::move(audit);
     Rerank(job);
   }
@@ -726,11 +767,15 @@ AuditVerdict TileScheduler::FinishAudit(const LeaseId& lease, const Digest& resu
   if (live.doomed || found == job.audits.end()) return verdict;
   verdict.counted = true;
   Audit& audit = found->second;
-  audit.opinions[result].emplace(live.grant.worker, NameOfWorker(live.grant.worker));
+  WorkerHello voter;
   if (const auto by = workers_.find(live.grant.worker); by != workers_.end()) {
     ++by->second.committed;
     by->second.failures_in_a_row = 0;
+    voter = by->second.hello;
   }
+  voter.name = NameOfWorker(live.grant.worker);
+  const Digest committed = audit.committed;
+  audit.opinions[result].emplace(live.grant.worker, std::move(voter));
   const auto agreed = std::find_if(audit.opinions.begin(), audit.opinions.end(),
                                    [](const auto& opinion) { return opinion.second.size() >= 2; });
   if (agreed == audit.opinions.end()) {
@@ -742,21 +787,25 @@ AuditVerdict TileScheduler::FinishAudit(const LeaseId& lease, const Digest& resu
     return verdict;
   }
   ++job.audits_done;
-  std::map<WorkerId, std::string> wrong;
+  verdict.agreed = agreed->first == committed;
+  std::map<WorkerId, WorkerHello> wrong;
   for (const auto& [digest, workers] : audit.opinions) {
     if (digest != agreed->first) wrong.insert(workers.begin(), workers.end());
   }
   job.audits.erase(found);
   Rerank(job);
-  for (const auto& [id, name] : wrong) Convict(id, name, verdict);
+  for (const auto& [id, hello] : wrong) Convict(id, hello, verdict);
   return verdict;
 }
 
-void TileScheduler::Convict(const WorkerId& id, const std::string& name, AuditVerdict& verdict) {
-  verdict.convicted.push_back({id, name});
-  if (const auto at = workers_.find(id); at != workers_.end()) {  // else it has left
-    at->second.convicted = true;
-    const std::set<LeaseId> ending = at->second.leases;
+void TileScheduler::Convict(const WorkerId& id, const WorkerHello& hello, AuditVerdict& verdict) {
+  verdict.convicted.push_back({.id = id, .name = hello.name, .certified_as = hello.certified_as});
+  const std::string owner = OwnerOf(hello);
+  convicts_.insert(owner);
+  for (auto& [other, worker] : workers_) {
+    if (other != id && OwnerOf(worker.hello) != owner) continue;
+    worker.convicted = true;
+    const std::set<LeaseId> ending = worker.leases;
     for (const LeaseId& lease : ending) {
       LiveLease& live = leases_.at(lease);
       if (live.committing) {
@@ -767,12 +816,12 @@ void TileScheduler::Convict(const WorkerId& id, const std::string& name, AuditVe
     }
   }
   for (auto& [job_id, job] : jobs_) {
-    const auto known = std::find(job.names.begin(), job.names.end(), name);
-    if (known == job.names.end()) continue;
-    const auto index = static_cast<uint32_t>(known - job.names.begin());
+    std::vector<bool> theirs;
+    for (const std::string& name : job.names) theirs.push_back(IsOf(name, hello));
+    if (std::find(theirs.begin(), theirs.end(), true) == theirs.end()) continue;
     for (uint32_t i = 0; i < job.tiles.size(); ++i) {
       Tile& tile = job.tiles[i];
-      if (tile.state != TileState::kCommitted || tile.committed_by != index) continue;
+      if (tile.state != TileState::kCommitted || !theirs[tile.committed_by]) continue;
       if (const auto audit = job.audits.find(i); audit != job.audits.end()) {
         const std::optional<LeaseId> lease = audit->second.lease;
         if (lease && leases_.at(*lease).committing) {
@@ -786,6 +835,8 @@ void TileScheduler::Convict(const WorkerId& id, const std::string& name, AuditVe
       SetState(job, i, TileState::kQueued);
       verdict.reopened[job_id].push_back(i);
     }
+    // If nothing else was committed, any fingerprint may begin again.
+    ForgetUnusedFingerprint(job);
   }
 }
 
@@ -936,9 +987,15 @@ SchedulerNews TileScheduler::ReportFailure(const WorkerId& worker, const LeaseId
   }
   const std::string cause(error.message());
   if (IsPermanent(error.code()) && !grant.audit) {
-    FailJob(jobs_.at(grant.job), Annotate(error, "tile " + std::to_string(grant.tile)), grant.tile,
-            news);
-    return news;
+    Job& job = jobs_.at(grant.job);
+    if (const auto by = workers_.find(worker); by != workers_.end()) {
+      job.permanent.insert(OwnerOf(by->second.hello));
+    }
+    // Another worker is asked first, if there is one.
+    if (job.permanent.size() > 1 || !AnotherWorkerCouldTake(job, job.tiles[grant.tile], worker)) {
+      FailJob(job, Annotate(error, "tile " + std::to_string(grant.tile)), grant.tile, news);
+      return news;
+    }
   }
   Blame(grant, cause, Fault::kReported, news);
   return news;

@@ -26,11 +26,16 @@
 // forgiven, and a tile that was set aside by that is queued again. A tile that failed before is
 // leased as `careful`.
 //
+// Errors that no other worker would fare better with (an invalid argument) fail the job at once,
+// but only when two workers say so, where there are two: one broken worker must not fail every job.
+//
 // Audits. A share audit_fraction of the committed tiles, drawn at random, is rendered again by
 // another worker, which cannot tell such a lease from others; the tile counts as committed all the
 // time. If the results differ, further workers are asked until two agree. Who returned something
 // else is set aside for good, and every tile that it committed, under any id of its name, is
-// queued again.
+// queued again. For good means under any id, too: whoever comes back as the same owner gets no
+// tile for as long as this lives, and has one voice in an audit. The owner is the certificate where
+// there is one, else the name.
 #pragma once
 
 #include <chrono>
@@ -127,11 +132,13 @@ struct AuditVerdict {
   struct Convict {
     WorkerId id;
     std::string name;
+    std::string certified_as;  // all workers of this certificate are meant; empty: this one's name
   };
   std::vector<Convict> convicted;  // they returned what two others did not
   // Tiles that they had committed: queued again, to be dropped from the store before the caller
   // lets go of its lock.
   std::map<JobId, std::vector<uint32_t>> reopened;
+  bool agreed = false;  // the committed result was right: the tile is disputed no more
 };
 enum class AuditState {
   kNone,       // nothing to wait for
@@ -192,11 +199,16 @@ class TileScheduler {
   // Whether the tiles that are set aside stay so: false while a worker that vanished from one may
   // still come back.
   bool MayGiveUp(const JobId& job) const;
+  bool IsCommitted(const JobId& job, uint32_t tile) const;
   // Committed tiles about which workers disagree.
   std::vector<uint32_t> DisputedTiles(const JobId& job) const;
 
   // --- Workers ---
+  // A name that a worker has which is there gets a number behind it, so that names tell workers
+  // apart.
   void AddWorker(const WorkerId& id, const WorkerHello& hello);
+  // Whether it was found to return wrong pixels, under this id or another one of its owner.
+  bool IsConvicted(const WorkerHello& hello) const { return convicts_.contains(OwnerOf(hello)); }
   bool HasWorker(const WorkerId& id) const { return workers_.contains(id); }
   // Heard of it: it waits for work. False for an unknown one.
   bool Touch(const WorkerId& id);
@@ -259,11 +271,12 @@ class TileScheduler {
     std::vector<LeaseId> leases;  // at most two; no audits
   };
   struct Audit {
-    // Who returned what, with names; the committed result is among them.
-    std::map<Digest, std::map<WorkerId, std::string>> opinions;
+    // Who returned what; the committed result is among them.
+    std::map<Digest, std::map<WorkerId, WorkerHello>> opinions;
+    Digest committed;
     std::optional<LeaseId> lease;
     std::optional<TimePoint> disputed_at;
-    bool HasOpinionOf(const WorkerId& worker) const;
+    bool HasOpinionOf(const std::string& owner) const;
   };
   struct Job {
     ScheduledJob spec;
@@ -271,8 +284,10 @@ class TileScheduler {
     std::set<uint32_t> queued;  // open tiles in state kQueued, in order
     std::set<uint32_t> again;   // of these, the ones that were leased before
     std::map<WorkerId, uint32_t> last_tiles;
-    uint32_t begun = 0;          // how often a worker began somewhere
-    TimePoint comeback_until{};  // of workers that vanished from tiles which are set aside
+    std::set<std::string> permanent;  // owners of the workers that said that the job is wrong
+    TimePoint copies_after{};         // no slow tile is looked for before
+    uint32_t begun = 0;               // how often a worker began somewhere
+    TimePoint comeback_until{};       // of workers that vanished from tiles which are set aside
     std::set<LeaseId> leases;
     TileCounts counts;
     Digest fingerprint;
@@ -326,6 +341,11 @@ class TileScheduler {
   // queued, leases, audits and pause.
   void Rerank(const Job& job);
   void Unrank(const Job& job);
+  // Who answers for what a worker returns.
+  static std::string OwnerOf(const WorkerHello& hello) {
+    return hello.certified_as.empty() ? "name " + hello.name : "certificate " + hello.certified_as;
+  }
+  static bool IsOf(const std::string& name, const WorkerHello& owner);
   bool IsSetAside(const Worker& worker) const;
   bool IsThere(const Worker& worker) const;
   bool TakesFingerprint(const Job& job, const Worker& worker) const;
@@ -344,7 +364,7 @@ class TileScheduler {
   // Blames worker and tile for the loss of a lease, and tells of it; the tile may be set aside.
   void Blame(const LeaseGrant& grant, const std::string& cause, Fault fault, SchedulerNews& news);
   bool IsPoison(const Job& job, uint32_t tile);
-  void Convict(const WorkerId& id, const std::string& name, AuditVerdict& verdict);
+  void Convict(const WorkerId& id, const WorkerHello& hello, AuditVerdict& verdict);
   // After a first result that did not become durable.
   void ForgetUnusedFingerprint(Job& job);
   void FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile, SchedulerNews& news);
@@ -360,6 +380,7 @@ class TileScheduler {
   std::set<Rank> ready_, working_, auditing_;
   std::set<JobId> started_;          // whose time runs
   std::vector<Vanishing> vanished_;  // lately, in order of time
+  std::set<std::string> convicts_;   // owners
   std::mt19937_64 random_;           // which tiles are audited
   // Jobs of leases that ended, so that late results are counted: the most recent ones.
   std::map<LeaseId, JobId> ended_;

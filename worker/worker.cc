@@ -152,6 +152,7 @@ struct Worker::Impl {
         if (finished) return;
         if (stop_at && steady_clock::now() >= *stop_at + options.drain_time) {
           cancel = true;
+          changed.notify_all();
           // Heartbeats go on until the tile is given back; nothing else is waited for.
           changed.wait_until(lock, next, [&] { return finished; });
           if (finished) return;
@@ -182,7 +183,7 @@ struct Worker::Impl {
         if (answer.ok() || !TryAgain(answer.status()) || cancel.load()) break;
         LogTile(WorkerLogEntry::Level::kWarning,
                 "result not delivered, trying again: " + answer.status().ToString(), work);
-        BackOff();
+        BackOff(&cancel);
       }
     }
     {
@@ -233,13 +234,18 @@ struct Worker::Impl {
   }
 
   void ResetBackoff() { backoff = options.first_backoff; }
-  // Waits, but for Stop().
-  void BackOff() {
+  // Waits, but for Stop(); with `cancel` for that instead: a tile that is done is delivered while
+  // the worker stops, too.
+  void BackOff(const std::atomic<bool>* cancel = nullptr) {
     std::uniform_real_distribution<double> factor(0.5, 1.5);
     const auto wait = std::chrono::duration_cast<steady_clock::duration>(backoff * factor(jitter));
     backoff = std::min(backoff * 2, options.last_backoff);
     std::unique_lock lock(mutex);
-    changed.wait_for(lock, wait, [this] { return stop_at.has_value(); });
+    if (cancel == nullptr) {
+      changed.wait_for(lock, wait, [this] { return stop_at.has_value(); });
+    } else {
+      changed.wait_for(lock, wait, [cancel] { return cancel->load(); });
+    }
   }
 
   void Log(WorkerLogEntry::Level level, std::string text) const {

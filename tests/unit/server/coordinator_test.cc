@@ -205,6 +205,63 @@ TEST_F(CoordinatorTest, AuditsFindWrongPixelsAndOpenThemAgain) {
   for (const WorkerStatus& worker : coordinator_->Workers()) {
     EXPECT_EQ(worker.set_aside, worker.name == "liar");
   }
+
+  // The job that was done before says what is wrong with it, also after a restart, until it is
+  // requeued.
+  EXPECT_EQ(coordinator_->Status(second)->suspect_tiles, 0u);
+  EXPECT_EQ(coordinator_->Status(job)->state, JobState::kDone);
+  EXPECT_EQ(coordinator_->Status(job)->suspect_tiles, 2u);
+  EXPECT_THAT(coordinator_->Explain(job)->lines, Contains(HasSubstr("2 tiles are of a worker")));
+  const auto back = coordinator_->Register({.version = FARPOINT_VERSION,
+                                            .fingerprint = TestFingerprint(),
+                                            .threads = 1,
+                                            .name = "liar"});
+  EXPECT_TRUE(absl::IsFailedPrecondition(back.status())) << back.status();
+  Open(folder.path());
+  EXPECT_EQ(coordinator_->Status(job)->suspect_tiles, 2u);
+  EXPECT_EQ(coordinator_->Status(job)->tiles, (TileCounts{.committed = 2, .total = 2}));
+  ASSERT_TRUE(coordinator_->Requeue(job, false).ok());
+  EXPECT_EQ(coordinator_->Status(job)->suspect_tiles, 0u);
+  EXPECT_EQ(coordinator_->Status(job)->tiles.queued, 2u);
+  audit_fraction_ = 0;
+  Open(folder.path());
+  const WorkerId one = RegisterOrDie("good");
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_TRUE(coordinator_->Return(one, Render(LeaseOrDie(one)))->accepted);
+  }
+  while (coordinator_->Status(job)->state != JobState::kDone) {
+    std::this_thread::sleep_for(milliseconds(5));
+  }
+  for (uint32_t tile = 0; tile < 2; ++tile) {
+    const auto film = DecodeFilm(coordinator_->FetchTile(job, tile)->bytes.bytes());
+    EXPECT_EQ(ImageHash(*film), ImageHash(FakeTile(film->rect(), {Layer::kBeauty, Layer::kDepth})));
+  }
+  ASSERT_TRUE(coordinator_->Requeue(job, false).ok());
+  EXPECT_EQ(coordinator_->Status(job)->state, JobState::kDone) << "nothing is wrong with it now";
+}
+
+// Who is right is not known yet when the coordinator dies; the tile must not pass for a good one.
+TEST_F(CoordinatorTest, ADisputedTileIsRenderedAgainAfterARestart) {
+  audit_fraction_ = 1;
+  TempFolder folder;
+  Open(folder.path());
+  const JobId job = SubmitOrDie(Spec("scene", 64, 32));
+  const WorkerId first = RegisterOrDie("first"), second = RegisterOrDie("second");
+  const TileWork tile = LeaseOrDie(first);
+  EXPECT_TRUE(coordinator_->Return(first, Render(tile))->accepted);
+  const TileWork audit = LeaseOrDie(second);
+  ASSERT_EQ(audit.tile, tile.tile);
+  TileResult other = Render(audit);
+  Film film = FakeTile(audit.rect, audit.frame.settings.layers);
+  film.Plane(Layer::kBeauty, 0)[0] = 0.125f;
+  other.bytes = Blob::FromVector(EncodeFilm(film));
+  other.sha256 = other.bytes.Hash();
+  EXPECT_TRUE(coordinator_->Return(second, other)->accepted);
+  EXPECT_EQ(coordinator_->Status(job)->tiles,
+            (TileCounts{.queued = 1, .committed = 1, .total = 2}));
+  Open(folder.path());
+  EXPECT_EQ(coordinator_->Status(job)->tiles, (TileCounts{.queued = 2, .total = 2}));
+  EXPECT_FALSE(coordinator_->FetchTile(job, tile.tile).ok());
 }
 
 TEST_F(CoordinatorTest, APoisonousTileIsNamedWhenAllOthersAreDone) {

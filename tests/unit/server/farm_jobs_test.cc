@@ -422,7 +422,7 @@ TEST_F(FarmJobs, AFailedJobStartsWithoutItsFailures) {
               .ok());
     }
     EXPECT_EQ(StateOf(job), JobState::kFailed);
-    EXPECT_THAT(Explained(job), Contains(HasSubstr("broken (worker 'w')")));
+    EXPECT_THAT(Explained(job), Contains(HasSubstr("broken (worker 'w")));
     ASSERT_TRUE(coordinator_->Requeue(job, false).ok());
     EXPECT_TRUE(StatusOf(job).error.ok());
   }

@@ -79,7 +79,7 @@ TEST_P(JobStoreTest, KeepsJobs) {
   stats.counts["surfels"] = 5;
   const StoredFrame frame{.camera = camera, .blobs = {DigestOf("s"), DigestOf("t"), {}}};
   ASSERT_TRUE(store_->SetBaked(a.id, 0, frame, {"n1", "n2"}, stats).ok());
-  ASSERT_TRUE(store_->SaveCounters(a.id, 7, 8).ok());
+  ASSERT_TRUE(store_->SaveCounters({{a.id, 7, 8}}).ok());
   ASSERT_TRUE(store_->SetState(b.id, JobState::kFailed, absl::NotFoundError("gone")).ok());
 
   const auto jobs = store_->LoadJobs();
@@ -277,6 +277,64 @@ TEST_P(JobStoreTest, RequeueGoesOnOrStartsAnew) {
   EXPECT_TRUE(store_->CommitTile(a.id, 1, ResultOf("y"), DigestOf("g")).ok());
   EXPECT_TRUE(store_->ReadTile(a.id, 1).ok());
   EXPECT_TRUE(absl::IsNotFound(store_->Requeue({"unknown"}, true)));
+}
+
+TEST_P(JobStoreTest, LinesOfSeveralJobsAreAddedTogether) {
+  StoredJob a = NewJob("aaaaaaaa"), b = NewJob("bbbbbbbb");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  ASSERT_TRUE(store_->InsertJob(b, "").ok());
+  const auto added = store_->AppendLogs(
+      {{a.id, {.text = "one"}}, {b.id, {.text = "two"}}, {a.id, {.text = "three"}}});
+  ASSERT_TRUE(added.ok()) << added.status();
+  EXPECT_EQ(*added, std::vector<bool>(3, true));
+  const auto lines = store_->LastLogLines(a.id, LogLevel::kInfo, 10);
+  ASSERT_EQ(lines->size(), 2u);
+  EXPECT_EQ(std::get<LogLine>((*lines)[0].body).text, "one");
+  EXPECT_EQ(std::get<LogLine>((*lines)[1].body).text, "three");
+  EXPECT_EQ((*lines)[1].sequence, (*lines)[0].sequence + 1);
+}
+
+TEST_P(JobStoreTest, TilesOfAWorkerInJobsThatAreDoneBecomeSuspectUntilTheyAreRequeued) {
+  StoredJob done = NewJob("aaaaaaaa"), open = NewJob("bbbbbbbb");
+  for (StoredJob* job : {&done, &open}) {
+    ASSERT_TRUE(store_->InsertJob(*job, "").ok());
+    ASSERT_TRUE(store_->SetBaked(job->id, 0, SomeFrame(), {}, {}).ok());
+    ASSERT_TRUE(store_->CommitTile(job->id, 0, ResultOf("0"), DigestOf("f"), "liar").ok());
+    ASSERT_TRUE(store_->CommitTile(job->id, 1, ResultOf("1"), DigestOf("f"), "good").ok());
+    ASSERT_TRUE(store_->CommitTile(job->id, 2, ResultOf("2"), DigestOf("f"), "liar/2").ok());
+    ASSERT_TRUE(store_->CommitTile(job->id, 3, ResultOf("3"), DigestOf("f"), "liars").ok());
+  }
+  ASSERT_TRUE(store_->SetState(done.id, JobState::kDone, absl::OkStatus()).ok());
+  const auto by_name = store_->MarkSuspects("liar", false);
+  ASSERT_TRUE(by_name.ok()) << by_name.status();
+  EXPECT_EQ(*by_name, (std::map<JobId, uint32_t>{{done.id, 1}}));
+  EXPECT_EQ(*store_->MarkSuspects("liar", true), (std::map<JobId, uint32_t>{{done.id, 1}}))
+      << "those that are new";
+  EXPECT_EQ((*store_->LoadJobs())[0].suspect_tiles, 2u);
+  EXPECT_EQ((*store_->LoadJobs())[1].suspect_tiles, 0u);
+  EXPECT_TRUE((*store_->Tiles(done.id))[0].suspect);
+  EXPECT_FALSE((*store_->Tiles(done.id))[1].suspect);
+  ASSERT_TRUE(store_->MarkSuspect(done.id, 0, false).ok());
+  EXPECT_EQ((*store_->LoadJobs())[0].suspect_tiles, 1u);
+  ASSERT_TRUE(store_->Requeue(done.id, false).ok());
+  ASSERT_EQ(store_->Tiles(done.id)->size(), 3u);
+  EXPECT_EQ((*store_->Tiles(done.id))[2].tile, 3u);
+  EXPECT_EQ((*store_->LoadJobs())[0].suspect_tiles, 0u);
+}
+
+// Tiles of one job have one fingerprint, also if all that a first worker returned was dropped.
+TEST_P(JobStoreTest, AJobWithoutTilesTakesTheFingerprintOfTheNextOne) {
+  StoredJob a = NewJob("aaaaaaaa");
+  ASSERT_TRUE(store_->InsertJob(a, "").ok());
+  ASSERT_TRUE(store_->CommitTile(a.id, 0, ResultOf("0"), DigestOf("f")).ok());
+  EXPECT_TRUE(store_->HasTile(a.id, 0, ResultOf("0").sha256));
+  EXPECT_FALSE(store_->HasTile(a.id, 0, ResultOf("1").sha256));
+  ASSERT_TRUE(store_->DropTiles(a.id, {0}).ok());
+  EXPECT_FALSE(store_->HasTile(a.id, 0, ResultOf("0").sha256));
+  ASSERT_TRUE(store_->CommitTile(a.id, 0, ResultOf("0"), DigestOf("g")).ok());
+  EXPECT_EQ((*store_->LoadJobs())[0].fingerprint, DigestOf("g"));
+  ASSERT_TRUE(store_->CommitTile(a.id, 1, ResultOf("1"), DigestOf("h")).ok());
+  EXPECT_EQ((*store_->LoadJobs())[0].fingerprint, DigestOf("g"));
 }
 
 TEST_P(JobStoreTest, KeepsSoManyLinesOfLogAndSaysSo) {
@@ -563,7 +621,7 @@ TEST(JobStore, SurvivesDeathAtEveryWritePoint) {
         tell('t');
       }
       if (!(*store)->AppendLog(job.id, {.text = "a line"}).ok()) ::_exit(7);
-      if (!(*store)->SaveCounters(job.id, 1, 2).ok()) ::_exit(8);
+      if (!(*store)->SaveCounters({{job.id, 1, 2}}).ok()) ::_exit(8);
       if (!(*store)->SetState(job.id, JobState::kDone, absl::OkStatus()).ok()) ::_exit(9);
       tell('d');
       ::_exit(0);

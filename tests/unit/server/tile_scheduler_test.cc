@@ -478,6 +478,58 @@ TEST_F(Audits, TheAuditorMayBeTheLiar) {
   EXPECT_EQ(audited_->Counts({"a"}).committed, 1u);
 }
 
+TEST_F(Audits, AConvictStaysOneUnderAnotherId) {
+  Add("a", 4);
+  const WorkerId liar = Join("liar");
+  Return(liar, "x'");
+  Return(Join("good"), "x");
+  Return(Join("third"), "x");
+  ASSERT_EQ(verdict_.convicted.size(), 1u);
+  EXPECT_TRUE(audited_->IsConvicted({.name = "name of liar"}));
+  EXPECT_FALSE(audited_->IsConvicted({.name = "name of good"}));
+  audited_->RemoveWorker(liar);
+  audited_->AddWorker({"again"}, {.fingerprint = DigestOf("f"), .name = "name of liar"});
+  EXPECT_FALSE(audited_->Lease({"again"}).has_value());
+  ASSERT_EQ(audited_->Workers().size(), 3u);
+  for (const WorkerStatus& worker : audited_->Workers()) {
+    EXPECT_EQ(worker.set_aside, worker.name == "name of liar");
+  }
+}
+
+// Whoever restarts between its result and the audit would otherwise confirm itself.
+TEST_F(Audits, AWorkerHasOneVoiceUnderHoweverManyIds) {
+  Add("a", 1);
+  const WorkerId first = Join("1");
+  Return(first, "x'");
+  audited_->RemoveWorker(first);
+  audited_->AddWorker({"2"}, {.fingerprint = DigestOf("f"), .name = "name of 1"});
+  EXPECT_FALSE(audited_->Lease({"2"}).has_value());
+  EXPECT_EQ(audited_->Audits({"a"}), AuditState::kNone) << "nobody else is there";
+  EXPECT_TRUE(Return(Join("3"), "x").audit);
+}
+
+TEST_F(Audits, AllWorkersOfACertificateAreOne) {
+  const auto join = [&](const std::string& id, const std::string& certificate) {
+    audited_->AddWorker({id}, {.fingerprint = DigestOf("f"),
+                               .name = certificate + "/" + id,
+                               .certified_as = certificate});
+    return WorkerId{id};
+  };
+  Add("a", 3);
+  const WorkerId one = join("one", "liar"), two = join("two", "liar"), good = join("good", "good");
+  Return(one, "x'");
+  const LeaseGrant of_two = Return(two, "y");
+  EXPECT_FALSE(of_two.audit) << "it may not confirm what the other one returned";
+  EXPECT_EQ(Return(good, "x").tile, 0u);
+  EXPECT_EQ(Return(good, "y").tile, of_two.tile);
+  EXPECT_EQ(Return(join("third", "third"), "x").tile, 0u);
+  ASSERT_EQ(verdict_.convicted.size(), 1u);
+  EXPECT_EQ(verdict_.convicted[0].certified_as, "liar");
+  EXPECT_FALSE(audited_->Lease(two).has_value());
+  EXPECT_TRUE(audited_->IsConvicted({.name = "another", .certified_as = "liar"}));
+  EXPECT_EQ(audited_->Counts({"a"}), (TileCounts{.queued = 3, .total = 3}));
+}
+
 TEST_F(Audits, WithoutAThirdWorkerADisagreementIsNotDecided) {
   Add("a", 1);
   Return(Join("1"), "x");
@@ -572,6 +624,38 @@ TEST_F(TileSchedulerTest, PermanentErrorsFailTheJobAtOnce) {
   ASSERT_EQ(news.failed.size(), 1u);
   EXPECT_TRUE(absl::IsInvalidArgument(news.failed[0].error));
   EXPECT_THAT(std::string(news.failed[0].error.message()), HasSubstr("bad scene"));
+}
+
+// One broken worker would fail every job of the farm.
+TEST_F(TileSchedulerTest, PermanentErrorsAreBelievedOfTwoWorkersWhereThereAreTwo) {
+  AddJob("a", 2);
+  const WorkerId broken = AddWorker("broken"), good = AddWorker("good");
+  const auto grant = scheduler_.Lease(broken);
+  EXPECT_TRUE(
+      scheduler_.ReportFailure(broken, grant->lease, false, absl::InvalidArgumentError("bad"))
+          .failed.empty());
+  // A second time it is no other worker that says so.
+  const auto next = scheduler_.Lease(broken);
+  ASSERT_TRUE(next && next->tile != grant->tile);
+  EXPECT_TRUE(
+      scheduler_.ReportFailure(broken, next->lease, false, absl::InvalidArgumentError("bad"))
+          .failed.empty());
+  const auto again = scheduler_.Lease(good);
+  ASSERT_TRUE(again.has_value());
+  const SchedulerNews news =
+      scheduler_.ReportFailure(good, again->lease, false, absl::InvalidArgumentError("bad"));
+  ASSERT_EQ(news.failed.size(), 1u);
+  EXPECT_TRUE(absl::IsInvalidArgument(news.failed[0].error));
+}
+
+TEST_F(TileSchedulerTest, NamesTellWorkersApartThatAreThere) {
+  for (const char* id : {"1", "2", "3"}) scheduler_.AddWorker({id}, {.name = "render"});
+  EXPECT_EQ(scheduler_.FindWorker({"1"})->name, "render");
+  EXPECT_EQ(scheduler_.FindWorker({"2"})->name, "render#2");
+  EXPECT_EQ(scheduler_.FindWorker({"3"})->name, "render#3");
+  scheduler_.RemoveWorker({"2"});
+  scheduler_.AddWorker({"4"}, {.name = "render"});
+  EXPECT_EQ(scheduler_.FindWorker({"4"})->name, "render#2");
 }
 
 TEST_F(TileSchedulerTest, AWorkerThatFailsRepeatedlyIsSetAsideForAWhile) {

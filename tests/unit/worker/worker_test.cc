@@ -66,6 +66,7 @@ class FakeLink final : public CoordinatorLink, public BlobSource {
     if (!return_errors.empty()) {
       const absl::Status error = return_errors.front();
       return_errors.pop_front();
+      changed.notify_all();
       return error;
     }
     returned.push_back(result);
@@ -270,6 +271,20 @@ TEST_F(WorkerTest, StopWithTimeToDrainFinishesTheTile) {
   StopAndJoin();
   EXPECT_TRUE(link_.failures.empty());
   EXPECT_EQ(link_.returned.size(), 1u);
+}
+
+// A coordinator whose disk is full must not be sent the tile over and over while a worker stops.
+TEST_F(WorkerTest, ADrainingWorkerWaitsBetweenItsTries) {
+  constexpr size_t kErrors = 1'000'000;
+  link_.return_errors.assign(kErrors, absl::UnavailableError("the disk is full"));
+  link_.Give("a");
+  Start({}, milliseconds(200));
+  EXPECT_TRUE(link_.WaitFor([&] { return link_.return_errors.size() < kErrors; }));
+  StopAndJoin();
+  // Half of a millisecond at least between two.
+  EXPECT_LT(kErrors - link_.return_errors.size(), 2000u);
+  ASSERT_EQ(link_.failures.size(), 1u);
+  EXPECT_TRUE(link_.failures[0].given_back);
 }
 
 TEST_F(WorkerTest, StopBeforeRunEndsAtOnce) {
