@@ -79,6 +79,7 @@ std::string StateText(const JobStatus& status) {
   if (status.state == JobState::kRendering) {
     text +=
         ", " + std::to_string(static_cast<int>(std::clamp(status.progress, 0.0, 1.0) * 100)) + " %";
+    if (status.eta_s) text += ", eta " + DurationText(*status.eta_s);
   }
   return text;
 }

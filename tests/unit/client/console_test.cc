@@ -80,6 +80,15 @@ TEST(Console, WritesALinePerTenthWhereThereIsNoTerminal) {
   EXPECT_NE(text.find("farpoint: rendering, 50 of 100 tiles, 50 %\n"), std::string::npos);
 }
 
+TEST(Console, ALineSaysHowLongItWillTake) {
+  Capture capture;
+  Console console(capture.file(), false, ConsoleLevel::kInfo, false);
+  JobStatus status = Rendering(5, 10);
+  status.eta_s = 65;
+  console.Progress(status);
+  EXPECT_EQ(capture.Text(), "farpoint: rendering, 5 of 10 tiles, 50 %, eta 1:05\n");
+}
+
 TEST(Console, ReportsOfSeveralJobsNameThem) {
   Capture capture;
   Console console(capture.file(), true, ConsoleLevel::kInfo, false);
