@@ -4,7 +4,12 @@ find_package(Threads REQUIRED)
 find_package(absl CONFIG REQUIRED)
 find_package(OpenSSL REQUIRED)
 find_package(TBB CONFIG REQUIRED)
-find_package(embree 3.13 CONFIG REQUIRED)
+# Embree 4 where there is one (Debian 13, Ubuntu 24.04), else 3.13 (Debian 12); core/accel takes both.
+# A package of another major version does not count as a newer one, so both are asked for.
+find_package(embree 4 CONFIG QUIET)
+if(NOT embree_FOUND)
+  find_package(embree 3.13 CONFIG REQUIRED)
+endif()
 find_package(OpenEXR CONFIG REQUIRED)
 find_package(PNG REQUIRED)
 find_package(nlohmann_json CONFIG REQUIRED)
