@@ -87,10 +87,37 @@ bool ReadWholeFile(std::vector<unsigned char>* out, std::string* error, const st
   return true;
 }
 
+// tinygltf 2.9 and later ask for it.
+[[maybe_unused]] bool FileSize(size_t* bytes, std::string* error, const std::string& name,
+                               void* user) {
+  const auto& files = static_cast<const BufferFiles*>(user)->by_name;
+  const auto it = files.find(name);
+  if (it == files.end()) {
+    *error = "'" + name + "' is not part of the asset";
+    return false;
+  }
+  *bytes = it->second.bytes.size();
+  return true;
+}
+
 bool WriteWholeFile(std::string* error, const std::string&, const std::vector<unsigned char>&,
                     void*) {
   *error = "nothing is written while a scene is read";
   return false;
+}
+
+template <typename Callbacks>  // tinygltf::FsCallbacks, whose fields depend on its version
+Callbacks CallbacksFor(BufferFiles& files) {
+  Callbacks callbacks = {};
+  callbacks.FileExists = FileExists;
+  callbacks.ExpandFilePath = ExpandFilePath;
+  callbacks.ReadWholeFile = ReadWholeFile;
+  callbacks.WriteWholeFile = WriteWholeFile;
+  if constexpr (requires { callbacks.GetFileSizeInBytes; }) {
+    callbacks.GetFileSizeInBytes = FileSize;
+  }
+  callbacks.user_data = &files;
+  return callbacks;
 }
 
 // Keeps the encoded bytes; what is used is decoded when the scene is prepared.
@@ -232,7 +259,7 @@ class Importer {
     bool loaded = false;
     try {
       tinygltf::TinyGLTF loader;
-      loader.SetFsCallbacks({FileExists, ExpandFilePath, ReadWholeFile, WriteWholeFile, &files});
+      loader.SetFsCallbacks(CallbacksFor<tinygltf::FsCallbacks>(files));
       loader.SetImageLoader(KeepEncodedImage, nullptr);
       const auto* bytes = reinterpret_cast<const unsigned char*>(file.bytes().data());
       if (container.binary) {
