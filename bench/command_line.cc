@@ -331,6 +331,22 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   service->add_option("--bin", line.service.bin_dir,
                       "Folder of farpoint-server, farpoint-worker and farpoint [this program's]");
 
+  CLI::App* figures = app.add_subcommand(
+      "figures",
+      "The pictures of the manual, and the error and time of what they show; writes PNG files, "
+      "figures.json and figures.md");
+  AddCommonOptions(*figures, line.output_dir, line.figures.quick);
+  figures->add_option("--side", line.figures.side_px, "Pixels of a frame's side")
+      ->capture_default_str()
+      ->check(CLI::IsMember({64, 128, 256, 512}));
+  figures->add_option("--paths", line.figures.paths, "Of the reference, per pixel")
+      ->capture_default_str()
+      ->check(CLI::Range(16, 1 << 20));
+  figures->add_option("--seed", line.figures.seed, "Of every random choice")->capture_default_str();
+  figures->add_option("--threads", line.figures.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
@@ -345,6 +361,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
                             : scale->parsed()     ? scale
                             : skip->parsed()      ? skip
                             : service->parsed()   ? service
+                            : figures->parsed()   ? figures
                                                   : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
@@ -363,6 +380,7 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
               : scale->parsed()     ? BenchVerb::kScale
               : skip->parsed()      ? BenchVerb::kSkip
               : service->parsed()   ? BenchVerb::kService
+              : figures->parsed()   ? BenchVerb::kFigures
                                     : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");

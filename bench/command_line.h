@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "bench/accuracy.h"
+#include "bench/figures.h"
 #include "bench/lights.h"
 #include "bench/micro.h"
 #include "bench/paper.h"
@@ -29,7 +30,8 @@ enum class BenchVerb {
   kStability,
   kScale,
   kSkip,
-  kService
+  kService,
+  kFigures
 };
 
 struct BenchCommandLine {
@@ -45,6 +47,7 @@ struct BenchCommandLine {
   ScaleOptions scale;
   SkipOptions skip;
   ServiceOptions service;
+  FiguresOptions figures;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -225,6 +225,19 @@ absl::Status Lights(const BenchCommandLine& line, std::ostream& out, std::ostrea
   return absl::OkStatus();
 }
 
+absl::Status Figures(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  FP_ASSIGN_OR_RETURN(const FiguresReport report,
+                      RunFigures(line.figures, line.output_dir, [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  const std::filesystem::path folder(line.output_dir);
+  FP_RETURN_IF_ERROR(WriteText(folder / "figures.json", FiguresJson(report)));
+  FP_RETURN_IF_ERROR(WriteText(folder / "figures.md", FiguresTables(report)));
+  out << FiguresTables(report) << "\n";
+  for (const std::string& file : report.files) out << (folder / file).string() << "\n";
+  return absl::OkStatus();
+}
+
 absl::Status Micro(const BenchCommandLine& line, std::ostream& out) {
   MicroOptions options = line.micro;
   options.json_path = (std::filesystem::path(line.output_dir) / "micro.json").string();
@@ -259,6 +272,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Skip(line, out, err);
     case BenchVerb::kService:
       return Service(line, out, err);
+    case BenchVerb::kFigures:
+      return Figures(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }
