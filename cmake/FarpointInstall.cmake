@@ -1,8 +1,8 @@
 # cmake --install BUILD [--prefix DIR] [--strip] [--component NAME]
 #
 # Components: client, coordinator, worker, health (a program each), bench (not installed unless
-# asked for), doc (licence, documentation, scenes, wire format, Slurm scripts, manual pages, shell
-# completion). docs/deploy.md lists what goes where.
+# asked for), doc (licence, documentation, scenes, wire format, Slurm's scripts, systemd's units,
+# manual pages, shell completion). docs/deploy.md lists what goes where.
 include(GNUInstallDirs)
 
 install(FILES LICENSE README.md CONTRIBUTING.md DESTINATION ${CMAKE_INSTALL_DOCDIR} COMPONENT doc)
@@ -23,6 +23,8 @@ if(FARPOINT_SERVICE)
     COMPONENT doc)
   install(PROGRAMS docker/slurm/coordinator.sbatch docker/slurm/workers.sbatch
     DESTINATION ${CMAKE_INSTALL_DATADIR}/farpoint/slurm COMPONENT doc)
+  install(FILES docker/systemd/farpoint-server.service docker/systemd/farpoint-worker.service
+    DESTINATION ${CMAKE_INSTALL_DATADIR}/farpoint/systemd COMPONENT doc)
 endif()
 
 # Manual pages and completion are what the programs say of themselves (tools/make_manual).

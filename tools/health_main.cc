@@ -63,6 +63,8 @@ absl::StatusOr<std::optional<HealthTls>> TlsOf(const HealthFlags& flags) {
         ReadCertificate({reinterpret_cast<const char*>(pem.bytes().data()), pem.size()},
                         server.certificate));
     if (!facts.hosts.empty()) tls.name = facts.hosts.front();
+    // A wildcard stands for one label, any.
+    if (tls.name.starts_with("*.")) tls.name.replace(0, 1, "coordinator");
   }
   return tls;
 }

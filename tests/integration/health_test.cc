@@ -58,6 +58,16 @@ TEST(Health, ACoordinatorIsAskedWithTheCertificatesThatItHasItself) {
   EXPECT_NE(gone.exit_code, 2);
 }
 
+TEST(Health, ACertificateForAWholeDomainWillDo) {
+  Farm farm;
+  const std::string own = farm.File("own");
+  ASSERT_EQ(farm.Client({"certs", "init", "--dir", own, "--server", "*.farm.example"}).exit_code,
+            0);
+  farm.StartServer({"--certs", own});
+  const RunResult good = Ask(farm, {farm.address(), "--timeout", "30", "--certs", own}, 0);
+  EXPECT_EQ(good.exit_code, 0) << good.err;
+}
+
 TEST(Health, UsageErrorsAreTold) {
   Farm farm;
   int run = 0;
