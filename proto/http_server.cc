@@ -219,18 +219,22 @@ class Connection final : public httplib::Stream {
   std::string certificates_;
 };
 
+// void, and from cpp-httplib 0.14 on bool: whether the task was taken.
+using Enqueued = decltype(std::declval<httplib::TaskQueue&>().enqueue(std::function<void()>()));
+
 // Threads that take connections; who brings one while all are busy waits.
 class BoundedPool final : public httplib::TaskQueue {
  public:
   explicit BoundedPool(size_t threads) {
     for (size_t i = 0; i < threads; ++i) threads_.emplace_back([this] { Work(); });
   }
-  void enqueue(std::function<void()> task) override {
+  Enqueued enqueue(std::function<void()> task) override {
     std::unique_lock lock(mutex_);
     room_.wait(lock, [this] { return tasks_.size() < threads_.size(); });
     tasks_.push_back(std::move(task));
     lock.unlock();
     work_.notify_one();
+    return static_cast<Enqueued>(true);
   }
   void shutdown() override {
     {
@@ -329,17 +333,27 @@ class HttpServerImpl final : public HttpServer, private httplib::Server {
       connection.NextRequest();
       bool closed = false;
       current_certificates = &connection.certificates();
-      const bool answered =
-          process_request(connection, left == 1, closed, [](httplib::Request& request) {
-            // Nothing announced is no body; the library would read until the peer closes.
-            if (!request.has_header("Content-Length") && !request.has_header("Transfer-Encoding")) {
-              request.set_header("Content-Length", "0");
-            }
-          });
+      const bool answered = Process(connection, left == 1, closed);
       current_certificates = nullptr;
       if (!answered || closed) return true;
     }
     return true;
+  }
+
+  // Newer versions want addresses, which they only tell the handler.
+  template <typename Stream>
+  bool Process(Stream& connection, bool last, bool& closed) {
+    const auto set_up = [](httplib::Request& request) {
+      // Nothing announced is no body; the library would read until the peer closes.
+      if (!request.has_header("Content-Length") && !request.has_header("Transfer-Encoding")) {
+        request.set_header("Content-Length", "0");
+      }
+    };
+    if constexpr (requires { this->process_request(connection, last, closed, set_up); }) {
+      return this->process_request(connection, last, closed, set_up);
+    } else {
+      return this->process_request(connection, "", 0, "", 0, last, closed, set_up);
+    }
   }
 
   void Serve(const httplib::Request& from, httplib::Response& to) {
