@@ -54,6 +54,10 @@ class FaultyFrame final : public RenderedFrame {
     while (tile.Contains(faults_.hang_x, faults_.hang_y)) {
       std::this_thread::sleep_for(std::chrono::hours(1));
     }
+    // Not known to the compiler, so that the loop stays.
+    volatile bool for_ever = tile.Contains(faults_.spin_x, faults_.spin_y);
+    while (for_ever) {
+    }
     TileOutput output;
     if (frame_ != nullptr) {
       FP_ASSIGN_OR_RETURN(output, frame_->RenderTile(tile, executor, progress, cancel));
@@ -165,6 +169,7 @@ absl::Status RunWorker(const Values& values) {
   faults.tile_ms = static_cast<int>(values.Number("tile_ms", 0));
   std::tie(faults.crash_x, faults.crash_y) = values.Place("crash");
   std::tie(faults.hang_x, faults.hang_y) = values.Place("hang");
+  std::tie(faults.spin_x, faults.spin_y) = values.Place("spin");
   faults.wrong = values.Number("wrong", 0);
   faults.fails = values.Number("fails", 0) != 0;
   faults.seed = static_cast<uint64_t>(values.Number("seed", 1));

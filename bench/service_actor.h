@@ -17,6 +17,7 @@ struct RendererFaults {
   int tile_ms = 0;                 // each takes so long more, with progress
   int crash_x = -1, crash_y = -1;  // SIGSEGV in that block
   int hang_x = -1, hang_y = -1;    // computes that block for ever without a processor
+  int spin_x = -1, spin_y = -1;    // and with one
   double wrong = 0;                // share of tiles with a pixel that is not right
   bool fails = false;              // every tile
   uint64_t seed = 1;

@@ -195,7 +195,8 @@ absl::StatusOr<double> TimeToDoneAgain(const ServiceContext& context, const std:
   FP_ASSIGN_OR_RETURN(const auto relay, Relay::Start(farm->port(), context.options.seed));
   const std::string through = "127.0.0.1:" + std::to_string(relay->port());
   std::vector<std::string> values = {"render=null"};
-  values.push_back(what == "hang" ? "hang=0,0" : "tile_ms=3600000");
+  const bool from_the_lease = what == "hang" || what == "spin";
+  values.push_back(from_the_lease ? what + "=0,0" : "tile_ms=3600000");
   FP_ASSIGN_OR_RETURN(const size_t victim, farm->StartActor("worker", values, through));
   FP_ASSIGN_OR_RETURN(const JobId job,
                       farm->Submit({.width = 32, .height = 32, .integrator = Integrator::kPt}));
@@ -210,14 +211,14 @@ absl::StatusOr<double> TimeToDoneAgain(const ServiceContext& context, const std:
     if (status.workers.size() == 2) break;
     Sleep(10);
   }
-  if (what != "hang") Sleep(1500);
+  if (!from_the_lease) Sleep(1500);
   const Stopwatch watch;
   if (what == "kill") farm->worker(victim).Signal(SIGKILL);
   if (what == "stop") farm->worker(victim).Signal(SIGSTOP);
   if (what == "cut") relay->SetSilent(true);
   FP_RETURN_IF_ERROR(farm->WaitUntilDone(job, seconds(60)).status());
   // A thread that hangs does so from its lease on.
-  const double took = what == "hang" ? since_lease.seconds() : watch.seconds();
+  const double took = from_the_lease ? since_lease.seconds() : watch.seconds();
   if (what == "stop") farm->worker(victim).Signal(SIGCONT);
   return took;
 }
@@ -259,6 +260,7 @@ absl::Status RunKills(const ServiceContext& context, ServiceResult& result) {
   } kinds[] = {{"kill", "s until the tile of a killed worker (SIGKILL) is done again", 1},
                {"stop", "s of a stopped one (SIGSTOP)", 5},
                {"hang", "s of one whose render thread hangs, from the lease on", 5},
+               {"spin", "s of one whose render thread computes for ever, from the lease on", 5},
                {"cut", "s of one whose link is cut (a relay that goes silent)", 5}};
   for (const auto& kind : kinds) {
     if (context.options.quick && kind.bound > 1) continue;

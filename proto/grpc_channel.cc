@@ -18,6 +18,9 @@ constexpr int kHandshakeMs = 10000;
 constexpr int kMaxStreams = 1024;
 constexpr int kMaxHeaderBytes = 16 << 10;
 constexpr std::chrono::milliseconds kProbeTime{3000};
+// What a connection reads at a time at first; it grows with what arrives. An idle one holds as
+// much.
+constexpr int kFirstReadBytes = 1024;
 // Threads of the synchronous services that stay when their call is done. With gRPC's two, most
 // calls of a busy farm begin a thread and end it.
 constexpr int kKeptThreads = 1024;
@@ -104,6 +107,7 @@ void ConfigureServer(grpc::ServerBuilder& builder, size_t network_bytes) {
   grpc::ResourceQuota quota("farpoint");
   quota.Resize(network_bytes);
   builder.SetResourceQuota(quota);
+  builder.AddChannelArgument(GRPC_ARG_TCP_READ_CHUNK_SIZE, kFirstReadBytes);
   builder.SetMaxSendMessageSize(kMaxResponseBytes);
   builder.SetSyncServerOption(grpc::ServerBuilder::SyncServerOption::MAX_POLLERS, kKeptThreads);
 }

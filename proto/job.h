@@ -345,6 +345,7 @@ struct LeaseProgress {
   bool rendering = false;  // blobs and scene are there
   // Processor time of the worker's whole process; 0: not known.
   std::chrono::milliseconds cpu{0};
+  uint64_t pulse = 0;  // grows with small steps of the work (core/base/pulse.h); 0: not counted
 };
 inline constexpr size_t kMaxPlaceBytes = 200;  // of LeaseProgress::at
 // Whether to go on after a heartbeat, and whether a result was taken.

@@ -6,6 +6,7 @@
 #include <cerrno>
 #include <chrono>
 #include <filesystem>
+#include <utility>
 #include <vector>
 
 #include "core/base/blob.h"
@@ -69,6 +70,7 @@ absl::StatusOr<TlsMaterial> LoadTls(const TlsPaths& paths, TlsUse use, int64_t n
         "--tls-cert: not given; a coordinator needs a certificate (farpoint certs init)");
   }
   TlsMaterial material;
+  material.paths = paths;
   FP_ASSIGN_OR_RETURN(material.ca, ReadText(paths.ca));
   FP_ASSIGN_OR_RETURN(const CertificateFacts ca,
                       ReadCertificate(material.ca, "'" + paths.ca + "'"));
@@ -82,6 +84,41 @@ absl::StatusOr<TlsMaterial> LoadTls(const TlsPaths& paths, TlsUse use, int64_t n
   FP_ASSIGN_OR_RETURN(material.facts,
                       ReadCertificate(material.certificate, "'" + paths.certificate + "'"));
   FP_RETURN_IF_ERROR(CheckOwn(paths, material, use, now_s));
+  return material;
+}
+
+TlsWatch::TlsWatch(TlsPaths paths, TlsUse use) : paths_(std::move(paths)), use_(use) {
+  seen_ = Signature();
+}
+
+std::string TlsWatch::Signature() const {
+  std::string text;
+  for (const std::string* path : {&paths_.ca, &paths_.certificate, &paths_.key}) {
+    struct stat facts {};
+    if (path->empty() || ::stat(path->c_str(), &facts) != 0) {
+      text += "-;";
+      continue;
+    }
+    for (const int64_t part :
+         {int64_t{facts.st_mtim.tv_sec}, int64_t{facts.st_mtim.tv_nsec}, int64_t{facts.st_size},
+          static_cast<int64_t>(facts.st_ino), int64_t{facts.st_mode}}) {
+      text += std::to_string(part) + ",";
+    }
+    text += ";";
+  }
+  return text;
+}
+
+std::optional<absl::StatusOr<TlsMaterial>> TlsWatch::Look(int64_t now_s) {
+  const std::string now = Signature();
+  if (now == seen_ || now == told_) return std::nullopt;
+  absl::StatusOr<TlsMaterial> material = LoadTls(paths_, use_, now_s);
+  if (material.ok()) {
+    seen_ = now;
+    return material;
+  }
+  if (std::exchange(failed_, now) != now) return std::nullopt;
+  told_ = now;
   return material;
 }
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <string>
 
 #include "core/base/status.h"
@@ -21,6 +22,7 @@ TlsPaths PathsIn(const std::string& directory, const std::string& name);
 struct TlsMaterial {
   std::string ca, certificate, key;  // PEM; the last two empty: known by a token
   CertificateFacts facts;            // of the certificate
+  TlsPaths paths;                    // where they were read
 };
 enum class TlsUse { kServer, kPeer };
 
@@ -30,6 +32,24 @@ enum class TlsUse { kServer, kPeer };
 // may be read by its group), or a path is missing; kUnauthenticated: the certificate has expired,
 // is not valid yet at `now_s`, or another authority's.
 absl::StatusOr<TlsMaterial> LoadTls(const TlsPaths& paths, TlsUse use, int64_t now_s);
+
+// Finds out that the files were replaced, as they are before a certificate expires. They are not
+// replaced at one instant: an error is told when they have stood still from one look to the next,
+// once. Not thread-safe.
+class TlsWatch {
+ public:
+  TlsWatch(TlsPaths paths, TlsUse use);
+  // What lies there now if it is not what lay there before; LoadTls's error if it cannot be used:
+  // then what was read before goes on being the process's.
+  std::optional<absl::StatusOr<TlsMaterial>> Look(int64_t now_s);
+
+ private:
+  std::string Signature() const;
+
+  const TlsPaths paths_;
+  const TlsUse use_;
+  std::string seen_, failed_, told_;  // signatures
+};
 
 // What stands on a command line: --certs, or --tls-ca, --tls-cert and --tls-key, or neither.
 struct TlsFlags {

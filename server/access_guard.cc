@@ -39,6 +39,8 @@ AccessGuard::AccessGuard(AccessOptions options)
       clock_(options_.clock ? options_.clock : std::make_shared<SteadyClock>()) {
   tokens_file_.path = options_.tokens_file;
   revoked_file_.path = options_.revoked_file;
+  ca_file_.path = options_.ca_file;
+  ca_ = options_.ca;
   telling_since_ = next_look_ = clock_->Now();
   std::lock_guard lock(mutex_);
   Reload();
@@ -77,6 +79,14 @@ void AccessGuard::Reload() {
       }
     }
   }
+  if (Changed(ca_file_) && ca_file_.inode != 0) {
+    // A file that is being replaced is none for a moment: what was known goes on.
+    if (absl::StatusOr<std::string> text = ReadList(ca_file_.path);
+        text.ok() && ReadCertificate(*text, "the authority").ok() && *text != ca_) {
+      ca_ = *std::move(text);
+      known_.clear();
+    }
+  }
   if (Changed(revoked_file_)) {
     revoked_file_.error = absl::OkStatus();
     revoked_.clear();
@@ -103,9 +113,10 @@ absl::StatusOr<Caller> AccessGuard::ByCertificate(std::string_view pem) {
   Reload();
   auto at = known_.find(hash);
   if (at == known_.end() || now_s > at->second.valid_until_s) {
+    const std::string ca = ca_;
     lock.unlock();
     Known known;
-    known.refusal = CheckIssued(pem, options_.ca, /*server=*/false, now_s);
+    known.refusal = CheckIssued(pem, ca, /*server=*/false, now_s);
     known.valid_until_s = now_s + kRefusalHoldsS;
     if (known.refusal.ok()) {
       const auto facts = ReadCertificate(pem, "the certificate");

@@ -25,6 +25,7 @@ namespace farpoint {
 
 struct AccessOptions {
   std::string ca;            // PEM: who issues certificates
+  std::string ca_file;       // read again when it changes, if it can be read; empty: never
   std::string tokens_file;   // proto/access.h, ParseTokens; empty or absent: no tokens
   std::string revoked_file;  // ParseRevoked; empty or absent: none
   // Of one client or admin, over all of its connections; workers are not limited.
@@ -87,7 +88,8 @@ class AccessGuard {
   const std::shared_ptr<const Clock> clock_;
   std::mutex mutex_;
   std::chrono::steady_clock::time_point next_look_;  // guarded by mutex_, as all below
-  WatchedFile tokens_file_, revoked_file_;
+  WatchedFile tokens_file_, revoked_file_, ca_file_;
+  std::string ca_;
   std::unordered_map<Digest, TokenEntry, DigestHasher> tokens_;
   std::vector<std::string> revoked_;                       // sorted
   std::unordered_map<Digest, Known, DigestHasher> known_;  // by the hash of the PEM

@@ -71,8 +71,9 @@ class BlobServiceImpl final : public v1::BlobService::Service {
       if (!stream->Read(&chunk)) return absl::InvalidArgumentError("Put without a message");
       FP_ASSIGN_OR_RETURN(const Digest digest, DigestFromWire(chunk.sha256(), "sha256"));
       const uint64_t size = chunk.size_bytes();
+      std::unique_ptr<ClientLedger::Transfer> transfer;
       if (access_.ledger != nullptr) {
-        FP_RETURN_IF_ERROR(access_.ledger->MayStore(caller.name, size));
+        FP_ASSIGN_OR_RETURN(transfer, access_.ledger->BeginTransfer(caller.name, size));
       }
       FP_ASSIGN_OR_RETURN(const std::unique_ptr<BlobWriter> writer,
                           coordinator_.StartPut(digest, size));

@@ -150,20 +150,37 @@ absl::Status ClientLedger::Submitted(const std::string& client, const JobId& job
   return insert.Bind(1, job.value).Bind(2, client).Step().status();
 }
 
-absl::Status ClientLedger::MayStore(const std::string& client, uint64_t bytes) {
-  const uint64_t limit = options_.max_bytes;
-  if (limit == 0) return absl::OkStatus();
+absl::StatusOr<std::unique_ptr<ClientLedger::Transfer>> ClientLedger::BeginTransfer(
+    const std::string& client, uint64_t bytes) {
   std::lock_guard lock(mutex_);
-  const auto fits = [&](uint64_t stored) { return stored <= limit && bytes <= limit - stored; };
-  FP_ASSIGN_OR_RETURN(uint64_t stored, BytesCounted(client));
-  if (fits(stored)) return absl::OkStatus();
-  // Only now is it worth looking for what has left the store.
-  FP_ASSIGN_OR_RETURN(stored, BytesStored(client));
-  if (fits(stored)) return absl::OkStatus();
-  return absl::ResourceExhaustedError("'" + client + "' stores " + std::to_string(stored) +
-                                      " bytes here, and " + std::to_string(bytes) +
-                                      " more would be above the limit of " + std::to_string(limit) +
-                                      "; wait until older jobs are purged, or send less");
+  uint64_t& moving = on_the_way_[client];
+  const uint64_t limit = options_.max_bytes == 0 ? UINT64_MAX : options_.max_bytes;
+  const auto fits = [&](uint64_t stored) {
+    return stored <= limit && moving <= limit - stored && bytes <= limit - stored - moving;
+  };
+  uint64_t stored = 0;
+  if (options_.max_bytes != 0) {
+    FP_ASSIGN_OR_RETURN(stored, BytesCounted(client));
+    // Only if it is too much is it worth looking for what has left the store.
+    if (!fits(stored)) {
+      FP_ASSIGN_OR_RETURN(stored, BytesStored(client));
+    }
+  }
+  if (!fits(stored)) {
+    return absl::ResourceExhaustedError(
+        "'" + client + "' stores " + std::to_string(stored) + " bytes here and sends " +
+        std::to_string(moving) + ", and " + std::to_string(bytes) +
+        " more would be above the limit of " + std::to_string(limit) +
+        "; wait until older jobs are purged, or send less");
+  }
+  moving += bytes;
+  return std::unique_ptr<Transfer>(new Transfer(*this, client, bytes));
+}
+
+ClientLedger::Transfer::~Transfer() {
+  std::lock_guard lock(ledger_.mutex_);
+  const auto at = ledger_.on_the_way_.find(client_);
+  if ((at->second -= bytes_) == 0) ledger_.on_the_way_.erase(at);
 }
 
 absl::Status ClientLedger::Stored(const std::string& client, const Digest& digest, uint64_t bytes) {

@@ -7,10 +7,12 @@
 
 #include <cstdint>
 #include <functional>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "core/base/hash.h"
@@ -49,9 +51,25 @@ class ClientLedger {
   // may both pass.
   absl::Status MaySubmit(const std::string& client);
   absl::Status Submitted(const std::string& client, const JobId& job);
-  // kResourceExhausted if `bytes` more would be too many. Transfers at the same time are each held
-  // against what is stored already.
-  absl::Status MayStore(const std::string& client, uint64_t bytes);
+  // A transfer that was announced: its bytes count for as long as this lives, whoever else sends
+  // at the same time. The ledger must outlive it.
+  class Transfer {
+   public:
+    ~Transfer();
+    Transfer(const Transfer&) = delete;
+    Transfer& operator=(const Transfer&) = delete;
+
+   private:
+    friend class ClientLedger;
+    Transfer(ClientLedger& ledger, std::string client, uint64_t bytes)
+        : ledger_(ledger), client_(std::move(client)), bytes_(bytes) {}
+    ClientLedger& ledger_;
+    const std::string client_;
+    const uint64_t bytes_;
+  };
+  // kResourceExhausted if `bytes` more would be too many, with what is on its way.
+  absl::StatusOr<std::unique_ptr<Transfer>> BeginTransfer(const std::string& client,
+                                                          uint64_t bytes);
   absl::Status Stored(const std::string& client, const Digest& digest, uint64_t bytes);
   // Empty: not known.
   std::string OwnerOf(const JobId& job);
@@ -67,7 +85,8 @@ class ClientLedger {
   absl::StatusOr<std::vector<std::string>> Column(const char* sql, const std::string& client);
 
   std::mutex mutex_;
-  sqlite3* const database_;  // guarded by mutex_
+  sqlite3* const database_;                     // guarded by mutex_
+  std::map<std::string, uint64_t> on_the_way_;  // bytes by client; guarded by mutex_
   const ClientLedgerOptions options_;
 };
 

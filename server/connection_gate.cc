@@ -66,8 +66,12 @@ std::string HostOf(const sockaddr_storage& address) {
     ::inet_ntop(AF_INET, &reinterpret_cast<const sockaddr_in&>(address).sin_addr, text,
                 sizeof(text));
   } else if (address.ss_family == AF_INET6) {
-    ::inet_ntop(AF_INET6, &reinterpret_cast<const sockaddr_in6&>(address).sin6_addr, text,
-                sizeof(text));
+    in6_addr v6 = reinterpret_cast<const sockaddr_in6&>(address).sin6_addr;
+    // Whoever has one address of IPv6 has the 2^64 of its network.
+    if (!IN6_IS_ADDR_V4MAPPED(&v6) && !IN6_IS_ADDR_LOOPBACK(&v6)) {
+      std::memset(v6.s6_addr + 8, 0, 8);
+    }
+    ::inet_ntop(AF_INET6, &v6, text, sizeof(text));
   }
   std::string_view host = text;
   // The same machine over a socket of both families.

@@ -66,6 +66,14 @@ std::chrono::milliseconds BlockTime(const RenderSettings& settings, const FilmSp
   return std::chrono::milliseconds(static_cast<int64_t>(1000 * std::min(seconds, 86400.0)));
 }
 
+// A step (core/base/pulse.h) is one receiver or record: its paths and shadow rays, each generously
+// 20 µs, and twenty times of all that.
+std::chrono::milliseconds StepTime(const RenderSettings& settings) {
+  const double rays = 1.0 * settings.paths + settings.light_samples;
+  return std::chrono::milliseconds(
+      static_cast<int64_t>(1000 * std::min(20 * (20e-6 * rays + 0.01), 86400.0)));
+}
+
 SchedulerOptions SchedulerOptionsOf(const CoordinatorOptions& options) {
   SchedulerOptions s;
   s.silence_time = options.silence_time;
@@ -1068,6 +1076,7 @@ class CoordinatorImpl final : public Coordinator {
     if (!committed.empty()) scheduled.fingerprint = stored.fingerprint;
     scheduled.max_time = std::chrono::seconds(stored.spec.limits.max_seconds);
     scheduled.lease_time = BlockTime(stored.spec.settings, stored.spec.film);
+    scheduled.step_time = StepTime(stored.spec.settings);
     scheduled.open = false;
     scheduled.paused = stored.paused;
     scheduler_.AddJob(scheduled);

@@ -10,6 +10,8 @@
 #include <unistd.h>
 
 #include <atomic>
+#include <mutex>
+#include <vector>
 
 #include "proto/grpc_channel.h"
 #include "proto/grpc_status.h"
@@ -19,6 +21,9 @@
 namespace farpoint {
 
 namespace {
+
+// Servers that stand beside the one with the newest certificate.
+constexpr size_t kMostFronts = 2;
 
 std::string_view View(const grpc::string_ref& text) { return {text.data(), text.size()}; }
 
@@ -57,6 +62,7 @@ class GrpcServerImpl final : public GrpcServer {
     if (!options_.tls) return;
     guard_ =
         std::make_unique<AccessGuard>(AccessOptions{.ca = options_.tls->ca,
+                                                    .ca_file = options_.tls->paths.ca,
                                                     .tokens_file = options_.tokens_file,
                                                     .revoked_file = options_.revoked_file,
                                                     .calls_per_second = options_.calls_per_second,
@@ -65,17 +71,19 @@ class GrpcServerImpl final : public GrpcServer {
                                                     .refused = options_.refused});
   }
   ~GrpcServerImpl() override {
-    if (server_ != nullptr) Shutdown(std::chrono::milliseconds(0));
+    if (!fronts_.empty()) Shutdown(std::chrono::milliseconds(0));
   }
 
   absl::Status Listen(const std::string& address) {
+    address_ = address;
+    if (options_.tls) not_after_s_ = options_.tls->facts.not_after_s;
     FP_ASSIGN_OR_RETURN(gate_,
                         ConnectionGate::Listen({.address = address,
                                                 .tls = options_.tls.has_value(),
                                                 .max_connections = options_.max_connections,
                                                 .max_per_host = options_.max_connections_per_host,
                                                 .refused = options_.refused}));
-    FP_RETURN_IF_ERROR(MakeServices());
+    FP_RETURN_IF_ERROR(MakeAccess());
     grpc::EnableDefaultHealthCheckService(true);
     // Registering twice would be an error; several servers in one process are a test's business.
     static const bool reflection = [] {
@@ -83,29 +91,29 @@ class GrpcServerImpl final : public GrpcServer {
       return true;
     }();
     (void)reflection;
-    grpc::ServerBuilder builder;
-    ConfigureServer(builder, options_.network_bytes);
-    std::shared_ptr<grpc::ServerCredentials> credentials = grpc::InsecureServerCredentials();
-    if (options_.tls) {
-      credentials = ServerTls(*options_.tls);
-      credentials->SetAuthMetadataProcessor(std::make_shared<GuardProcessor>(*guard_));
-    }
-    acceptor_ = builder.experimental().AddExternalConnectionAcceptor(
-        grpc::ServerBuilder::experimental_type::ExternalConnectionType::FROM_FD, credentials);
-    builder.RegisterService(blobs_.get());
-    builder.RegisterService(jobs_.get());
-    builder.RegisterService(workers_.get());
-    server_ = builder.BuildAndStart();
-    if (server_ == nullptr) {
-      return absl::UnavailableError("the server on '" + address +
-                                    "' does not start; are certificate and key in order?");
-    }
-    server_->GetHealthCheckService()->SetServingStatus(true);
+    FP_RETURN_IF_ERROR(StartFront(options_.tls));
     gate_->Start([this](int fd) {
+      std::lock_guard lock(mutex_);
       grpc::experimental::ExternalConnectionAcceptor::NewConnectionParameters connection;
       connection.fd = fd;
-      acceptor_->HandleNewConnection(&connection);
+      fronts_.back()->acceptor->HandleNewConnection(&connection);
     });
+    return absl::OkStatus();
+  }
+
+  absl::Status Renew(const TlsMaterial& tls) override {
+    FP_RETURN_IF_ERROR(StartFront(tls));
+    std::unique_ptr<Front> oldest;
+    {
+      std::lock_guard lock(mutex_);
+      not_after_s_ = tls.facts.not_after_s;
+      if (fronts_.size() <= kMostFronts) return absl::OkStatus();
+      oldest = std::move(fronts_.front());
+      fronts_.erase(fronts_.begin());
+    }
+    // Whoever is still there connects again, as after any loss.
+    oldest->server->Shutdown(std::chrono::system_clock::now());
+    oldest->server->Wait();
     return absl::OkStatus();
   }
 
@@ -132,16 +140,59 @@ class GrpcServerImpl final : public GrpcServer {
 
   void StopServing() override {
     draining_ = true;
-    server_->GetHealthCheckService()->SetServingStatus(false);
+    std::lock_guard lock(mutex_);
+    for (const auto& front : fronts_) {
+      front->server->GetHealthCheckService()->SetServingStatus(false);
+    }
   }
   void Shutdown(std::chrono::milliseconds grace) override {
     gate_->Stop();
-    server_->Shutdown(std::chrono::system_clock::now() + grace);
-    server_->Wait();
+    const auto end = std::chrono::system_clock::now() + grace;
+    std::lock_guard lock(mutex_);
+    for (const auto& front : fronts_) {
+      front->server->Shutdown(end);
+      front->server->Wait();
+    }
   }
 
  private:
-  absl::Status MakeServices() {
+  // gRPC's server takes its certificate when it is built. A new one gets a server of its own,
+  // beside those that serve the connections which stand.
+  struct Front {
+    std::unique_ptr<grpc::Service> blobs, jobs, workers;
+    std::unique_ptr<grpc::experimental::ExternalConnectionAcceptor> acceptor;
+    std::unique_ptr<grpc::Server> server;
+  };
+
+  absl::Status StartFront(const std::optional<TlsMaterial>& tls) {
+    auto front = std::make_unique<Front>();
+    front->blobs = MakeBlobService(coordinator_, access_);
+    front->jobs = MakeJobService(coordinator_, access_);
+    front->workers = MakeWorkerService(coordinator_, access_);
+    grpc::ServerBuilder builder;
+    ConfigureServer(builder, options_.network_bytes);
+    std::shared_ptr<grpc::ServerCredentials> credentials = grpc::InsecureServerCredentials();
+    if (tls) {
+      credentials = ServerTls(*tls);
+      credentials->SetAuthMetadataProcessor(std::make_shared<GuardProcessor>(*guard_));
+    }
+    front->acceptor = builder.experimental().AddExternalConnectionAcceptor(
+        grpc::ServerBuilder::experimental_type::ExternalConnectionType::FROM_FD, credentials);
+    builder.RegisterService(front->blobs.get());
+    builder.RegisterService(front->jobs.get());
+    builder.RegisterService(front->workers.get());
+    front->server = builder.BuildAndStart();
+    if (front->server == nullptr) {
+      return absl::UnavailableError("the server on '" + address_ +
+                                    "' does not start; are certificate and key in order?");
+    }
+    front->server->GetHealthCheckService()->SetServingStatus(!draining_);
+    std::lock_guard lock(mutex_);
+    fronts_.push_back(std::move(front));
+    return absl::OkStatus();
+  }
+
+  absl::Status MakeAccess() {
     if (guard_ != nullptr) {
       ClientLedgerOptions ledger;
       ledger.path = options_.ledger_file;
@@ -169,13 +220,10 @@ class GrpcServerImpl final : public GrpcServer {
       if (options_.tls) {
         facts.max_jobs = options_.max_jobs_per_client;
         facts.max_bytes = options_.max_bytes_per_client;
-        facts.certificate_not_after_s = options_.tls->facts.not_after_s;
+        facts.certificate_not_after_s = not_after_s_;
       }
       return facts;
     };
-    blobs_ = MakeBlobService(coordinator_, access_);
-    jobs_ = MakeJobService(coordinator_, access_);
-    workers_ = MakeWorkerService(coordinator_, access_);
     return absl::OkStatus();
   }
 
@@ -187,9 +235,10 @@ class GrpcServerImpl final : public GrpcServer {
   Traffic traffic_;
   ServiceAccess access_;
   std::unique_ptr<ConnectionGate> gate_;
-  std::unique_ptr<grpc::Service> blobs_, jobs_, workers_;
-  std::unique_ptr<grpc::experimental::ExternalConnectionAcceptor> acceptor_;
-  std::unique_ptr<grpc::Server> server_;
+  std::string address_;
+  std::atomic<int64_t> not_after_s_ = 0;
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<Front>> fronts_;  // guarded by mutex_; the last takes connections
 };
 
 }  // namespace

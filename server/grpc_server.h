@@ -59,6 +59,10 @@ class GrpcServer {
   virtual const Traffic& traffic() const = 0;
   virtual bool draining() const = 0;
 
+  // New connections see this certificate; those that stand keep theirs, but for those that have
+  // outlived several. kUnavailable if it cannot be used: then nothing changes.
+  virtual absl::Status Renew(const TlsMaterial& tls) = 0;
+
   // Health says NOT_SERVING from now on; calls still go through.
   virtual void StopServing() = 0;
   // Takes no more calls; those in progress have `grace` to end.

@@ -319,7 +319,19 @@ int Main(int argc, char** argv) {
                                 ":" + port + (tls ? ", TLS" : ", in the clear") + ", store '" +
                                 flags.store + "'");
 
-  while (!signals.Wait(std::chrono::hours(1))) {
+  std::optional<TlsWatch> watch;
+  if (tls) watch.emplace(tls_material->paths, TlsUse::kServer);
+  while (!signals.Wait(std::chrono::seconds(1))) {
+    if (!watch) continue;
+    const std::optional<absl::StatusOr<TlsMaterial>> now = watch->Look(NowUnixS());
+    if (!now) continue;
+    const absl::Status renewed = now->ok() ? (*server)->Renew(**now) : now->status();
+    if (renewed.ok()) {
+      WriteLog(LogLevel::kInfo, "the certificate was replaced: new connections see it");
+    } else {
+      WriteLog(LogLevel::kError, "the certificate was replaced by one that cannot be used: " +
+                                     std::string(renewed.message()));
+    }
   }
   WriteLog(LogLevel::kInfo, "draining: no new leases; a second signal ends at once");
   (*server)->StopServing();

@@ -24,6 +24,7 @@ constexpr Duration kStormWindow = std::chrono::minutes(10);
 constexpr size_t kStormFactor = 3;
 // A render thread that uses less than this part of one core does not compute.
 constexpr double kBusyFraction = 0.01;
+constexpr uint32_t kMostDoublings = 6;
 
 double Seconds(Duration d) { return std::chrono::duration<double>(d).count(); }
 
@@ -492,7 +493,7 @@ LeaseGrant TileScheduler::Grant(const WorkerId& worker, Job& job, uint32_t tile,
                 .speculative = speculative,
                 .careful = job.tiles[tile].failures > 0,
                 .audit = audit};
-  live.started = live.heard = live.progressed = live.busy = now;
+  live.started = live.heard = live.progressed = live.busy = live.stepped = now;
   if (!job.started) {
     job.started = now;
     started_.insert(job.spec.id);
@@ -642,6 +643,11 @@ RenewAnswer TileScheduler::Renew(const WorkerId& worker, const LeaseId& lease,
       used >= kBusyFraction * Seconds(now - live.busy)) {
     live.busy = now;
     live.busy_cpu = progress.cpu;
+  }
+  if (!progress.rendering || progress.pulse == 0 || progress.pulse != live.progress.pulse ||
+      progress.counter > live.progress.counter) {
+    live.stepped = now;
+    live.stepped_cpu = progress.cpu;
   }
   if (progress.counter > live.progress.counter) live.progressed = now;
   if (progress.counter >= live.progress.counter) live.progress = progress;
@@ -1007,6 +1013,7 @@ void TileScheduler::Forgive(Duration gap) {
     live.heard = std::min(now, live.heard + gap);
     live.progressed = std::min(now, live.progressed + gap);
     live.busy = std::min(now, live.busy + gap);
+    live.stepped = std::min(now, live.stepped + gap);
   }
   for (auto& [id, worker] : workers_) {
     worker.heard = std::min(now, worker.heard + gap);
@@ -1014,6 +1021,17 @@ void TileScheduler::Forgive(Duration gap) {
       worker.disconnected_at = std::min(now, *worker.disconnected_at + gap);
     }
   }
+}
+
+bool TileScheduler::GoesInCircles(const LiveLease& live) const {
+  if (!live.progress.rendering || live.progress.pulse == 0) return false;
+  const Job& job = jobs_.at(live.grant.job);
+  const uint32_t failures = std::min(job.tiles[live.grant.tile].failures, kMostDoublings);
+  const Duration patience = std::max(options_.stall_time, job.spec.step_time) * (1 << failures);
+  const Duration still = live.heard - live.stepped;
+  if (still < patience) return false;
+  // Whose process is starved of processor time gets on slowly: that is no fault.
+  return live.progress.cpu - live.stepped_cpu >= still / 2;
 }
 
 SchedulerNews TileScheduler::Tick() {
@@ -1045,6 +1063,9 @@ SchedulerNews TileScheduler::Tick() {
     } else if (live.progress.rendering && live.heard - live.busy >= options_.stall_time) {
       expire("a render thread hangs: neither progress nor processor time for " +
                  SecondsText(now - live.busy),
+             Fault::kReported);
+    } else if (GoesInCircles(live)) {
+      expire("a render thread computes, but has not got on for " + SecondsText(now - live.stepped),
              Fault::kReported);
     }
   }

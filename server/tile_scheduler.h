@@ -8,7 +8,9 @@
 //   - nothing was heard of its worker for silence_time, or its connection broke and did not come
 //     back within reconnect_time,
 //   - progress stood still for lease_time, or, while it renders, neither progress was made nor a
-//     processor used for stall_time: a thread hangs,
+//     processor used for stall_time: a thread hangs; or a processor was used, but no step was done
+//     (LeaseProgress::pulse) for as long, or for step_time if that is longer: a thread goes in
+//     circles. The latter is doubled with each failure of the tile, as a step may just be long,
 //   - its job ends, or its job commits a tile of another fingerprint.
 // A queued tile is leased only when it is open (its frame is baked) and its job is not paused.
 //
@@ -87,6 +89,7 @@ struct ScheduledJob {
   Digest fingerprint;                     // of the committed tiles; empty if there are none
   Duration max_time = Duration::max();    // from the first lease on
   Duration lease_time{};                  // if longer than the options' one
+  Duration step_time{};                   // how long a step may take, generously
   bool open = true;                       // false: no tile may be leased until OpenTiles names it
   bool paused = false;
 };
@@ -316,9 +319,9 @@ class TileScheduler {
   };
   struct LiveLease {
     LeaseGrant grant;
-    TimePoint started, heard, progressed, busy;
+    TimePoint started, heard, progressed, busy, stepped;
     LeaseProgress progress;
-    std::chrono::milliseconds busy_cpu{0};  // at `busy`
+    std::chrono::milliseconds busy_cpu{0}, stepped_cpu{0};  // at `busy`, at `stepped`
     bool committing = false;
     bool doomed = false;  // its worker was convicted while it was committing
   };
@@ -348,6 +351,7 @@ class TileScheduler {
   static bool IsOf(const std::string& name, const WorkerHello& owner);
   bool IsSetAside(const Worker& worker) const;
   bool IsThere(const Worker& worker) const;
+  bool GoesInCircles(const LiveLease& live) const;
   bool TakesFingerprint(const Job& job, const Worker& worker) const;
   bool AnotherWorkerCouldTake(const Job& job, const Tile& tile, const WorkerId& but) const;
   bool SomeWorkerCouldAudit(const Job& job, const Audit& audit) const;

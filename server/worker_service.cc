@@ -281,7 +281,8 @@ class WorkerServiceImpl final : public WorkerServiceBase {
                                               .at = request->at(),
                                               .rendering = request->rendering(),
                                               .cpu = std::chrono::milliseconds(static_cast<int64_t>(
-                                                  std::min(request->cpu_ms(), kMaxCpuMs)))}));
+                                                  std::min(request->cpu_ms(), kMaxCpuMs))),
+                                              .pulse = request->pulse()}));
       response->set_drop(answer.drop);
       response->set_reason(answer.reason);
       return absl::OkStatus();

@@ -29,11 +29,8 @@ constexpr std::chrono::milliseconds kAttendAgain{100};
 class GrpcLinkImpl final : public GrpcLink {
  public:
   GrpcLinkImpl(const std::string& address, const ChannelSecurity& security)
-      : channel_(OpenChannel(address, security)),
-        address_(address),
-        security_(security),
-        workers_(v1::WorkerService::NewStub(channel_)),
-        blobs_(v1::BlobService::NewStub(channel_)),
+      : address_(address),
+        connection_(std::make_shared<const Connection>(address, security)),
         attendant_([this] { AttendLoop(); }) {}
   ~GrpcLinkImpl() override {
     {
@@ -46,18 +43,21 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
   absl::StatusOr<WorkerWelcome> Register(const WorkerHello& hello) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kCallTimeout);
     v1::RegisterResponse response;
-    FP_RETURN_IF_ERROR(ExplainFailure(
-        FromGrpc(workers_->Register(&context, ToWire(hello), &response)), address_, security_));
+    FP_RETURN_IF_ERROR(
+        ExplainFailure(FromGrpc(connection->workers->Register(&context, ToWire(hello), &response)),
+                       address_, connection->security));
     return WelcomeFromWire(response);
   }
 
   absl::StatusOr<std::optional<TileWork>> Lease(const WorkerId& worker,
                                                 std::chrono::milliseconds wait) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, wait + kCallTimeout);
     v1::LeaseRequest request;
@@ -69,7 +69,7 @@ class GrpcLinkImpl final : public GrpcLink {
       if (cancelled_) return absl::CancelledError("the worker stops");
       waits_.insert(&context);
     }
-    const grpc::Status status = workers_->Lease(&context, request, &response);
+    const grpc::Status status = connection->workers->Lease(&context, request, &response);
     {
       std::lock_guard lock(mutex_);
       waits_.erase(&context);
@@ -82,7 +82,8 @@ class GrpcLinkImpl final : public GrpcLink {
 
   absl::StatusOr<RenewAnswer> Renew(const WorkerId& worker, const LeaseId& lease,
                                     const LeaseProgress& progress) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kRenewTimeout);
     v1::RenewRequest request;
@@ -93,17 +94,19 @@ class GrpcLinkImpl final : public GrpcLink {
     request.set_at(progress.at.substr(0, kMaxPlaceBytes));
     request.set_rendering(progress.rendering);
     request.set_cpu_ms(static_cast<uint64_t>(progress.cpu.count()));
+    request.set_pulse(progress.pulse);
     v1::RenewResponse response;
-    FP_RETURN_IF_ERROR(FromGrpc(workers_->Renew(&context, request, &response)));
+    FP_RETURN_IF_ERROR(FromGrpc(connection->workers->Renew(&context, request, &response)));
     return RenewAnswer{.drop = response.drop(), .reason = response.reason()};
   }
 
   absl::StatusOr<ReturnAnswer> Return(const WorkerId& worker, const TileResult& result) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kStreamTimeout);
     v1::ReturnResponse response;
-    const auto stream = workers_->Return(&context, &response);
+    const auto stream = connection->workers->Return(&context, &response);
     v1::ReturnChunk chunk;
     *chunk.mutable_header() = ToWire(worker, result);
     const std::span<const std::byte> bytes = result.bytes.bytes();
@@ -123,7 +126,8 @@ class GrpcLinkImpl final : public GrpcLink {
 
   absl::Status ReportFailure(const WorkerId& worker, const LeaseId& lease, bool given_back,
                              const absl::Status& error) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kCallTimeout);
     v1::ReportFailureRequest request;
@@ -133,16 +137,17 @@ class GrpcLinkImpl final : public GrpcLink {
     request.set_code(error.raw_code());
     request.set_message(std::string(error.message().substr(0, 2048)));
     v1::ReportFailureResponse response;
-    return FromGrpc(workers_->ReportFailure(&context, request, &response));
+    return FromGrpc(connection->workers->ReportFailure(&context, request, &response));
   }
 
   absl::Status Leave(const WorkerId& worker) override {
+    const std::shared_ptr<const Connection> connection = Current();
     grpc::ClientContext context;
     SetDeadline(context, kRenewTimeout);
     v1::LeaveRequest request;
     request.set_worker_id(worker.value);
     v1::LeaveResponse response;
-    const grpc::Status left = workers_->Leave(&context, request, &response);
+    const grpc::Status left = connection->workers->Leave(&context, request, &response);
     Attend({});
     return FromGrpc(left);
   }
@@ -163,13 +168,14 @@ class GrpcLinkImpl final : public GrpcLink {
   }
 
   absl::Status Stream(const Digest& digest, uint64_t offset_bytes, const Sink& sink) override {
-    AwaitConnection(*channel_, kReconnectTime);
+    const std::shared_ptr<const Connection> connection = Current();
+    AwaitConnection(*connection->channel, kReconnectTime);
     grpc::ClientContext context;
     SetDeadline(context, kStreamTimeout);
     v1::GetBlobRequest request;
     request.set_sha256(ToWire(digest));
     request.set_offset_bytes(offset_bytes);
-    const auto stream = blobs_->Get(&context, request);
+    const auto stream = connection->blobs->Get(&context, request);
     v1::GetBlobChunk chunk;
     uint64_t size = 0;
     bool first = true;
@@ -194,7 +200,31 @@ class GrpcLinkImpl final : public GrpcLink {
     return FromGrpc(stream->Finish());
   }
 
+  void Reconnect(const ChannelSecurity& security) override {
+    auto fresh = std::make_shared<const Connection>(address_, security);
+    std::lock_guard lock(mutex_);
+    connection_ = std::move(fresh);
+    // It is opened again on the new one; calls end on the one that they began on.
+    if (attending_ != nullptr) attending_->TryCancel();
+  }
+
  private:
+  struct Connection {
+    Connection(const std::string& address, const ChannelSecurity& given)
+        : security(given),
+          channel(OpenChannel(address, given)),
+          workers(v1::WorkerService::NewStub(channel)),
+          blobs(v1::BlobService::NewStub(channel)) {}
+    const ChannelSecurity security;
+    const std::shared_ptr<grpc::Channel> channel;
+    const std::unique_ptr<v1::WorkerService::Stub> workers;
+    const std::unique_ptr<v1::BlobService::Stub> blobs;
+  };
+  std::shared_ptr<const Connection> Current() {
+    std::lock_guard lock(mutex_);
+    return connection_;
+  }
+
   // A coordinator before data_sha256 sends none: the blob's own hash decides then.
   static bool HasHash(std::span<const std::byte> data, const std::string& sha256) {
     if (sha256.empty()) return true;
@@ -212,6 +242,7 @@ class GrpcLinkImpl final : public GrpcLink {
         continue;
       }
       const WorkerId worker = attended_;
+      const std::shared_ptr<const Connection> connection = connection_;
       grpc::ClientContext context;
       SetDeadline(context, kAttendTimeout);
       context.set_wait_for_ready(true);
@@ -219,14 +250,14 @@ class GrpcLinkImpl final : public GrpcLink {
       lock.unlock();
       v1::AttendRequest request;
       request.set_worker_id(worker.value);
-      const auto stream = workers_->Attend(&context, request);
+      const auto stream = connection->workers->Attend(&context, request);
       v1::AttendResponse nothing;
       while (stream->Read(&nothing)) {
       }
       const grpc::Status status = stream->Finish();
       lock.lock();
       attending_ = nullptr;
-      if (ending_ || attended_ != worker) continue;
+      if (ending_ || attended_ != worker || connection_ != connection) continue;
       // Not known any more: Lease and Renew hear it too, and the worker registers again.
       if (status.error_code() == grpc::StatusCode::NOT_FOUND ||
           status.error_code() == grpc::StatusCode::UNIMPLEMENTED) {
@@ -237,14 +268,11 @@ class GrpcLinkImpl final : public GrpcLink {
     }
   }
 
-  const std::shared_ptr<grpc::Channel> channel_;
   const std::string address_;
-  const ChannelSecurity security_;
-  const std::unique_ptr<v1::WorkerService::Stub> workers_;
-  const std::unique_ptr<v1::BlobService::Stub> blobs_;
   std::mutex mutex_;
-  bool cancelled_ = false;                // guarded by mutex_
-  std::set<grpc::ClientContext*> waits_;  // guarded by mutex_
+  std::shared_ptr<const Connection> connection_;  // guarded by mutex_
+  bool cancelled_ = false;                        // guarded by mutex_
+  std::set<grpc::ClientContext*> waits_;          // guarded by mutex_
   std::condition_variable attend_changed_;
   bool ending_ = false;                       // guarded by mutex_
   WorkerId attended_;                         // guarded by mutex_; empty: none

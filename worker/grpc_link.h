@@ -17,6 +17,9 @@ class GrpcLink : public CoordinatorLink, public BlobStreamer {
   // (proto/connection_probe.h).
   static std::unique_ptr<GrpcLink> Connect(const std::string& address,
                                            const ChannelSecurity& security = {});
+  // Calls from now on go over a new connection, with this certificate: the old one expires.
+  // Thread-safe.
+  virtual void Reconnect(const ChannelSecurity& security) = 0;
 };
 
 }  // namespace farpoint

@@ -6,6 +6,7 @@
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <optional>
 #include <string>
 #include <thread>
 
@@ -156,6 +157,21 @@ absl::StatusOr<std::unique_ptr<HttpServer>> StartMetrics(const WorkerFlags& flag
   return server;
 }
 
+// If the certificate was replaced, connects anew with it.
+void TakeNewCertificate(TlsWatch& watch, const ChannelSecurity& before, GrpcLink& link) {
+  const std::optional<absl::StatusOr<TlsMaterial>> now = watch.Look(NowUnixS());
+  if (!now) return;
+  if (!now->ok()) {
+    WriteLog(LogLevel::kError, "the certificate was replaced by one that cannot be used: " +
+                                   std::string(now->status().message()));
+    return;
+  }
+  ChannelSecurity security = before;
+  security.tls = **now;
+  link.Reconnect(security);
+  WriteLog(LogLevel::kInfo, "the certificate was replaced: connected anew with it");
+}
+
 int Main(int argc, char** argv) {
   WorkerFlags flags;
   flags.cache = DefaultCache();
@@ -235,8 +251,17 @@ int Main(int argc, char** argv) {
   const CrashReporter crashes([&](const std::string& cause) { worker.ReportCrash(cause); });
   std::atomic<bool> ended = false;
   std::thread stopper([&] {
+    std::optional<TlsWatch> watch;
+    if (security->tls) watch.emplace(security->tls->paths, TlsUse::kPeer);
+    auto next_look = std::chrono::steady_clock::now() + std::chrono::seconds(1);
     while (!ended.load()) {
-      if (!signals.Wait(std::chrono::milliseconds(100))) continue;
+      if (!signals.Wait(std::chrono::milliseconds(100))) {
+        if (watch && std::chrono::steady_clock::now() >= next_look) {
+          next_look = std::chrono::steady_clock::now() + std::chrono::seconds(1);
+          TakeNewCertificate(*watch, *security, *link);
+        }
+        continue;
+      }
       WriteLog(LogLevel::kInfo, "stopping: the tile in work is finished or given back");
       worker.Stop();
     }

@@ -119,6 +119,8 @@ absl::StatusOr<TileResult> TileRunner::Run(const TileWork& work, TileProgress& p
   result.bytes = Blob::FromVector(EncodeFilm(output.film));
   result.sha256 = result.bytes.Hash();
   result.stats = std::move(stats);
+  // A network that is slow to take it is no thread that hangs.
+  progress.rendering = false;
   return result;
 }
 

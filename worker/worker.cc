@@ -9,6 +9,7 @@
 
 #include "core/base/clock.h"
 #include "core/base/executor.h"
+#include "core/base/pulse.h"
 #include "worker/tile_runner.h"
 
 namespace farpoint {
@@ -130,7 +131,8 @@ struct Worker::Impl {
            .fraction = progress.fraction.load(),
            .at = progress.place(),
            .rendering = progress.rendering.load(),
-           .cpu = std::chrono::milliseconds(static_cast<int64_t>(1000 * ProcessCpuSeconds()))});
+           .cpu = std::chrono::milliseconds(static_cast<int64_t>(1000 * ProcessCpuSeconds())),
+           .pulse = Pulses()});
     };
     // Whether it is heard or not, the work goes on: the heartbeat hears what is to be done.
     progress.tell = [&] { (void)renew(); };

@@ -8,6 +8,7 @@
 #include <algorithm>
 
 #include "core/base/fp_trap.h"
+#include "core/base/pulse.h"
 
 #ifdef __SANITIZE_THREAD__
 extern "C" void __tsan_acquire(void* address);
@@ -63,7 +64,12 @@ void Executor::ForEach(size_t count, size_t grain, const std::function<void(size
   if (count == 0) return;
   if (threads_ == 1) {
     const FpTrap trap;
-    for (size_t i = 0; i < count; ++i) body(i);
+    grain = std::max<size_t>(1, grain);
+    for (size_t begin = 0; begin < count; begin += grain) {
+      const size_t end = begin + std::min(grain, count - begin);
+      for (size_t i = begin; i < end; ++i) body(i);
+      Pulse();
+    }
     return;
   }
   LoopOrder order;
@@ -75,6 +81,7 @@ void Executor::ForEach(size_t count, size_t grain, const std::function<void(size
                         order.BodyBegins();
                         for (size_t i = range.begin(); i != range.end(); ++i) body(i);
                         order.BodyEnds();
+                        Pulse();
                       });
   });
   order.Ends();

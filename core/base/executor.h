@@ -2,6 +2,8 @@
 //
 // Determinism: ForEach says nothing about the order in which indices run, so a body may write only
 // to what belongs to its index; sums over indices are made afterwards, in index order.
+//
+// After each piece there is a Pulse (core/base/pulse.h).
 #pragma once
 
 #include <cstddef>

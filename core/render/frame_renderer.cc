@@ -11,6 +11,7 @@
 #include <utility>
 
 #include "core/base/clock.h"
+#include "core/base/pulse.h"
 #include "core/irrcache/irradiance_cache.h"
 #include "core/math/sampling.h"
 #include "core/pbgi/cut_drawer.h"
@@ -447,6 +448,7 @@ class Renderer final : public FrameRenderer {
           receivers.push_back(r);
           sample_of.push_back(static_cast<uint32_t>(at));
         }
+        Pulse();
       }
     }
   }
@@ -465,6 +467,7 @@ class Renderer final : public FrameRenderer {
     const uint32_t each = (settings_.light_samples + settings_.spp - 1) / settings_.spp;
     LightCounters counters;
     for (size_t r = 0; r < receivers.size(); ++r) {
+      Pulse();
       if (!wanted[r]) continue;
       Sample& sample = samples[sample_of[r]];
       if (IsBlack(sample) && !wants_direct_irradiance_ && settings_.skips(kSkipBlack)) {
@@ -488,6 +491,7 @@ class Renderer final : public FrameRenderer {
     }
     LightCounters counters;
     for (size_t r = 0; r < receivers.size(); ++r) {
+      Pulse();
       if (!wanted[r]) continue;
       const TracedIrradiance traced = TraceIndirect(
           *scene_.accel, *scene_.lights, receivers[r], settings_.paths,
@@ -552,6 +556,7 @@ class Renderer final : public FrameRenderer {
     std::vector<GatherRecord> own;
     uint32_t last_pixel = ~0u;
     for (const uint32_t r : BlackLast(samples, sample_of)) {
+      Pulse();
       if (std::exchange(last_pixel, sample_of[r] / settings_.spp) != last_pixel) own.clear();
       if (!wanted[r]) continue;
       Sample& sample = samples[sample_of[r]];
@@ -625,6 +630,7 @@ class Renderer final : public FrameRenderer {
       records.clear();
       view.Collect({x0, y0, x0 + kSide, y0 + kSide}, records);
       for (size_t at = 0; at < groups[g].size(); at += 8) {
+        Pulse();
         const size_t count = std::min<size_t>(8, groups[g].size() - at);
         ServedReceiver served[8];
         Rgb e[8];
@@ -739,6 +745,7 @@ class Renderer final : public FrameRenderer {
     RasterCounters raster_counters;
     HiddenCounters hidden_counters;
     for (size_t c = 0; c < clusters.size(); ++c) {
+      Pulse();
       const ReceiverCluster& cluster = clusters[c];
       const bool any = std::any_of(cluster.members.begin(), cluster.members.end(),
                                    [&](uint32_t r) { return wanted[r] != 0; });

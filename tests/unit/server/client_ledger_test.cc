@@ -72,23 +72,35 @@ TEST_F(ClientLedgerTest, BytesCountForTheFirstWhoSentThem) {
   ASSERT_TRUE(ledger_->Stored("bob", Named("a"), 60).ok());
   EXPECT_EQ(ledger_->UseOf("alice")->bytes, 60u);
   EXPECT_EQ(ledger_->UseOf("bob")->bytes, 0u);
-  EXPECT_TRUE(ledger_->MayStore("alice", 40).ok());
-  const absl::Status refused = ledger_->MayStore("alice", 41);
+  EXPECT_TRUE(ledger_->BeginTransfer("alice", 40).ok());
+  const absl::Status refused = ledger_->BeginTransfer("alice", 41).status();
   EXPECT_TRUE(absl::IsResourceExhausted(refused));
   EXPECT_THAT(std::string(refused.message()), HasSubstr("stores 60 bytes"));
-  EXPECT_FALSE(ledger_->MayStore("alice", ~uint64_t{0}).ok()) << "no overflow";
-  EXPECT_FALSE(ledger_->MayStore("bob", 101).ok());
+  EXPECT_FALSE(ledger_->BeginTransfer("alice", ~uint64_t{0}).ok()) << "no overflow";
+  EXPECT_FALSE(ledger_->BeginTransfer("bob", 101).ok());
   // What has left the store makes room.
   gone_.insert(Named("a"));
-  EXPECT_TRUE(ledger_->MayStore("alice", 100).ok());
+  EXPECT_TRUE(ledger_->BeginTransfer("alice", 100).ok());
   EXPECT_EQ(ledger_->UseOf("alice")->bytes, 0u);
+}
+
+TEST_F(ClientLedgerTest, WhatIsOnItsWayCounts) {
+  Open(0, 100);
+  auto one = ledger_->BeginTransfer("alice", 60);
+  ASSERT_TRUE(one.ok());
+  const absl::Status refused = ledger_->BeginTransfer("alice", 60).status();
+  EXPECT_TRUE(absl::IsResourceExhausted(refused));
+  EXPECT_THAT(std::string(refused.message()), HasSubstr("sends 60"));
+  EXPECT_TRUE(ledger_->BeginTransfer("bob", 60).ok()) << "of each client";
+  one->reset();
+  EXPECT_TRUE(ledger_->BeginTransfer("alice", 60).ok());
 }
 
 TEST_F(ClientLedgerTest, WithoutLimitsNothingIsRefused) {
   Open(0, 0);
   for (int i = 0; i < 100; ++i) Submit("alice", std::to_string(i));
   EXPECT_TRUE(ledger_->MaySubmit("alice").ok());
-  EXPECT_TRUE(ledger_->MayStore("alice", ~uint64_t{0}).ok());
+  EXPECT_TRUE(ledger_->BeginTransfer("alice", ~uint64_t{0}).ok());
 }
 
 TEST(ClientLedger, AFileThatIsNoneIsAClearError) {

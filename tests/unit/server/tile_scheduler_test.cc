@@ -314,6 +314,57 @@ TEST_F(TileSchedulerTest, WhoComesBackDidNotDieOfItsTile) {
   EXPECT_EQ(scheduler_.Counts({"a"}).queued, 1u);
 }
 
+// Computes without a step: lost soon. With steps, starved, or with steps that are known to be long:
+// not.
+TEST_F(TileSchedulerTest, AThreadThatGoesInCirclesLosesItsTile) {
+  ScheduledJob job;
+  job.id = {"a"};
+  job.tiles = 3;
+  scheduler_.AddJob(job);
+  job.id = {"long steps"};
+  job.tiles = 1;
+  job.step_time = seconds(60);
+  scheduler_.AddJob(job);
+  const WorkerId circles = AddWorker("circles"), steps = AddWorker("steps"),
+                 starved = AddWorker("starved"), patient = AddWorker("patient");
+  std::vector<LeaseGrant> grants;
+  for (const WorkerId& worker : {circles, steps, starved, patient}) {
+    grants.push_back(*scheduler_.Lease(worker));
+  }
+  ASSERT_EQ(grants[3].job.value, "long steps");
+  std::vector<LeaseProgress> progress(4, {.counter = 1, .rendering = true, .pulse = 7});
+  SchedulerNews news;
+  Duration waited{};
+  const auto heartbeats = [&] {
+    clock_.Advance(milliseconds(500));
+    waited += milliseconds(500);
+    ++progress[1].pulse;
+    for (size_t i = 0; i < 4; ++i) {
+      progress[i].cpu += milliseconds(i == 2 ? 50 : 500);
+      scheduler_.Renew(grants[i].worker, grants[i].lease, progress[i]);
+    }
+    news = scheduler_.Tick();
+  };
+  while (news.lost.empty() && waited < seconds(30)) heartbeats();
+  ASSERT_EQ(news.lost.size(), 1u);
+  EXPECT_EQ(news.lost[0].grant.worker, circles);
+  EXPECT_THAT(news.lost[0].reason, HasSubstr("has not got on"));
+  EXPECT_LE(waited, options_.stall_time + seconds(1));
+  for (int i = 0; i < 20; ++i) {
+    heartbeats();
+    EXPECT_THAT(news.lost, IsEmpty());
+  }
+  // The tile's next worker has twice the time.
+  grants[0] = *scheduler_.Lease(AddWorker("next"));
+  ASSERT_TRUE(grants[0].careful);
+  waited = {};
+  news = {};
+  while (news.lost.empty() && waited < seconds(30)) heartbeats();
+  ASSERT_EQ(news.lost.size(), 1u);
+  EXPECT_GT(waited, 2 * options_.stall_time - seconds(1));
+  EXPECT_LE(waited, 2 * options_.stall_time + seconds(1));
+}
+
 TEST_F(TileSchedulerTest, AThreadThatHangsLosesItsTileLongBeforeASlowOne) {
   AddJob("a", 2);
   const WorkerId hung = AddWorker("hung"), slow = AddWorker("slow");
