@@ -17,8 +17,8 @@ import time
 
 PROJECT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
 # What the page promises.
-IMAGES = ["look.exr", "dusk.exr", "farm.exr", "street.exr", "alone.exr", "tls.exr",
-          "look.png", "dusk.png", "farm.png", "street.png"]
+IMAGES = ["look.exr", "dusk.exr", "farm.exr", "above.exr", "alone.exr", "tls.exr",
+          "look.png", "dusk.png", "farm.png", "above.png"]
 
 
 def free_port():
