@@ -175,6 +175,34 @@ class Install(unittest.TestCase):
                      for here, _, names in os.walk(prefix) for name in names]
         self.assertEqual([os.path.join("bin", "farpoint-worker")], installed)
 
+    def test_files_for_deploying_give_flags_that_the_programs_know(self):
+        docker = self.path("share", "doc", "farpoint", "docker")
+        # Commands as they stand there, over several lines or as lists.
+        found = 0
+        for name in ("Dockerfile", "compose.yaml", "try", "slurm/coordinator.sbatch",
+                     "slurm/workers.sbatch", "systemd/farpoint-server.service",
+                     "systemd/farpoint-worker.service"):
+            text = re.sub(r"\\\n", " ", self.text(docker, *name.split("/")))
+            text = re.sub(r"#.*", "", text)
+            program = None
+            for line in text.split("\n"):
+                named = re.search(r"farpoint-(server|worker|health)(?![\w.-])", line)
+                if re.match(r"ENTRYPOINT", line):
+                    program = named.group() if named else None
+                elif named and not line.startswith("RUN"):
+                    program = named.group()
+                elif not line.startswith("CMD"):
+                    program = None
+                if program is None:
+                    continue
+                flags = flags_of(self.help(program))
+                for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", line):
+                    if flag in ("--interval", "--timeout", "--start-period", "--retries"):
+                        continue  # HEALTHCHECK's
+                    found += 1
+                    self.assertIn(flag, flags, f"{name}: {line.strip()}")
+        self.assertGreaterEqual(found, 15)
+
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
