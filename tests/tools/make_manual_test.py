@@ -96,6 +96,15 @@ class MakeManual(TreeTest):
         self.assertIn("Silence (from 50).\nDefault: 4000.", page)
         self.assertIn("Share (0 to 1).\nDefault: 0.02.", page)
 
+    def test_defaults_may_stand_in_brackets_as_newer_versions_of_cli11_write_them(self):
+        self.assertEqual((0, ""), self.make())
+        before = self.read("man1/farpoint-server.1")
+        self.services["farpoint-server"] = re.sub(
+            r"=(4000|text|0\.02)$", r" [\1] ", self.services["farpoint-server"], flags=re.M)
+        self.assertIn("[4000] \n", self.services["farpoint-server"])
+        self.assertEqual((0, ""), self.make())
+        self.assertEqual(before, self.read("man1/farpoint-server.1"))
+
     def test_defaults_of_the_machine_are_left_out(self):
         self.make()
         page = self.read("man1/farpoint-worker.1")
