@@ -1,5 +1,7 @@
 #include "client/console.h"
 
+#include <sys/ioctl.h>
+
 #include <algorithm>
 #include <cmath>
 
@@ -29,10 +31,12 @@ std::string DurationText(double seconds) {
   return text;
 }
 
-std::string ProgressText(const JobStatus& status, int columns) {
+std::string ProgressText(const JobStatus& status, int columns, double in_state_s) {
   if (status.state == JobState::kQueued || status.state == JobState::kBaking ||
       (status.state == JobState::kPaused && status.tiles.committed == 0)) {
-    return std::string(NameOf(status.state));
+    std::string text(NameOf(status.state));
+    if (in_state_s >= 1) text += ", " + DurationText(in_state_s);
+    return text;
   }
   const double fraction = std::clamp(status.progress, 0.0, 1.0);
   char percent[16];
@@ -96,6 +100,12 @@ void Console::EraseBar() {
   bar_drawn_ = false;
 }
 
+int Console::Columns() const {
+  winsize size{};
+  if (::ioctl(::fileno(stream_), TIOCGWINSZ, &size) != 0 || size.ws_col == 0) return 79;
+  return std::clamp<int>(size.ws_col - 1, 20, 200);
+}
+
 void Console::Write(ConsoleLevel level, std::string_view prefix, std::string_view text) {
   if (level < level_ || (quiet_ && level < ConsoleLevel::kWarn)) return;
   std::lock_guard lock(mutex_);
@@ -111,7 +121,13 @@ void Console::Progress(const JobStatus& status) {
   std::lock_guard lock(mutex_);
   if (terminal_) {
     std::string line = "\r";
-    line.append(ProgressText(status, 79)).append("\x1b[K");
+    const auto now = std::chrono::steady_clock::now();
+    if (state_ != status.state) {
+      state_ = status.state;
+      state_since_ = now;
+    }
+    const double in_state_s = std::chrono::duration<double>(now - state_since_).count();
+    line.append(ProgressText(status, Columns(), in_state_s)).append("\x1b[K");
     std::fwrite(line.data(), 1, line.size(), stream_);
     bar_drawn_ = true;
   } else {

@@ -142,6 +142,7 @@ TEST(ProgressText, NamesTheStateBeforeThereAreTiles) {
   JobStatus status;
   status.state = JobState::kBaking;
   EXPECT_EQ(ProgressText(status, 79), "baking");
+  EXPECT_EQ(ProgressText(status, 79, 72.4), "baking, 1:12");
 }
 
 TEST(ProgressText, SaysHowManyFramesAreDoneAndThatAJobRests) {
