@@ -22,6 +22,7 @@ constexpr size_t kManyLeases = 64;
 // How long a vanished worker counts as a sign that the farm, not a tile, is at fault.
 constexpr Duration kStormWindow = std::chrono::minutes(10);
 constexpr size_t kStormFactor = 3;
+constexpr uint32_t kStormTries = 4;
 // A render thread that uses less than this part of one core does not compute.
 constexpr double kBusyFraction = 0.01;
 constexpr uint32_t kMostDoublings = 6;
@@ -917,15 +918,23 @@ void TileScheduler::FailJob(Job& job, absl::Status error, std::optional<uint32_t
 
 bool TileScheduler::IsPoison(const Job& job, uint32_t index) {
   const Tile& tile = job.tiles[index];
-  if (tile.failures >= options_.max_tile_failures) return true;
-  if (tile.dead.size() < options_.max_dead_workers) return false;
+  if (tile.dead.size() < options_.max_dead_workers && tile.failures < options_.max_tile_failures) {
+    return false;
+  }
   std::erase_if(vanished_,
                 [&](const Vanishing& v) { return clock_.Now() - v.when > kStormWindow; });
   const size_t here = static_cast<size_t>(
       std::count_if(vanished_.begin(), vanished_.end(),
                     [&](const Vanishing& v) { return v.job == job.spec.id && v.tile == index; }));
+  const size_t elsewhere = vanished_.size() - here;
+  if (tile.failures >= options_.max_tile_failures) {
+    // Where workers die by the hundred, some tile loses as many of them by chance.
+    return elsewhere <= kStormFactor * kStormFactor * here ||
+           tile.failures >= options_.max_tile_failures + here ||
+           tile.failures >= kStormTries * options_.max_tile_failures;
+  }
   if (tile.dead.size() >= options_.max_dead_workers + here) return true;  // without them, too
-  return vanished_.size() - here <= kStormFactor * here;
+  return elsewhere <= kStormFactor * here;
 }
 
 void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, Fault fault,

@@ -24,9 +24,9 @@
 // times, is set aside: it counts as failed, the job's other tiles go on, and the caller ends the
 // job when nothing else is left. Workers that just vanish may be a matter of the farm and not of
 // the tile: where more than three times as many vanished from other tiles lately, only
-// max_tile_failures counts. A worker that is heard of again did not die: what it was blamed for is
-// forgiven, and a tile that was set aside by that is queued again. A tile that failed before is
-// leased as `careful`.
+// max_tile_failures counts, and where more than nine times as many did, four times that. A worker
+// that is heard of again did not die: what it was blamed for is forgiven, and a tile that was set
+// aside by that is queued again. A tile that failed before is leased as `careful`.
 //
 // Errors that no other worker would fare better with (an invalid argument) fail the job at once,
 // but only when two workers say so, where there are two: one broken worker must not fail every job.

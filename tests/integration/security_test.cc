@@ -21,6 +21,7 @@
 namespace farpoint {
 namespace {
 
+namespace fs = std::filesystem;
 using std::chrono::milliseconds;
 using std::chrono::seconds;
 using testing::AllOf;
@@ -102,6 +103,62 @@ TEST_F(SecurityTest, AWholeJobGoesOverTls) {
   const Json status =
       Json::parse(Ask(TlsFlagsOf(certs_, "bob") + std::vector<std::string>{"--json", "-"}).out);
   EXPECT_EQ(status["jobs"][0]["owner"], "alice");
+}
+
+// Certificates expire: new ones are put where the old ones are, while everything runs.
+TEST_F(SecurityTest, NewCertificatesAreTakenWithoutARestart) {
+  Start();
+  farm_.StartWorker(1, {"--certs", certs_});
+  const auto replace = [&](const std::string& name, Role role, const std::string& host) {
+    const std::string folder = farm_.File("new");
+    fs::create_directory(folder);
+    for (const char* file : {"ca.pem", "ca.key"}) {
+      fs::copy_file(certs_ + "/" + file, folder + "/" + file, fs::copy_options::skip_existing);
+    }
+    const int64_t now_s = NowUnixS();
+    IssueInto(folder, name, role, now_s - 60, now_s + kTestDayS,
+              host.empty() ? std::vector<std::string>() : std::vector<std::string>{host});
+    fs::rename(folder + "/" + name + ".key", certs_ + "/" + name + ".key");
+    fs::rename(folder + "/" + name + ".pem", certs_ + "/" + name + ".pem");
+  };
+  const auto wait_for = [&](const std::string& text, size_t count) {
+    for (int i = 0; i < 600; ++i) {
+      const std::string logs = farm_.Logs();
+      size_t found = 0;
+      for (size_t at = logs.find(text); at != std::string::npos; at = logs.find(text, at + 1)) {
+        ++found;
+      }
+      if (found >= count) return true;
+      std::this_thread::sleep_for(milliseconds(50));
+    }
+    return false;
+  };
+  const auto ask = [&] {
+    return Ask(TlsFlagsOf(certs_, "bob") + std::vector<std::string>{"--json", "-"});
+  };
+  ASSERT_TRUE(wait_for("registered as", 1)) << farm_.Logs();
+  // One that names another machine shows that new connections see it.
+  replace("server", Role::kServer, "elsewhere.example");
+  ASSERT_TRUE(wait_for("new connections see it", 1)) << farm_.Logs();
+  EXPECT_NE(ask().exit_code, 0);
+  for (size_t i = 2; i <= 4; ++i) {
+    replace("server", Role::kServer, "127.0.0.1");
+    ASSERT_TRUE(wait_for("new connections see it", i)) << farm_.Logs();
+  }
+  replace("worker", Role::kWorker, "");
+  ASSERT_TRUE(wait_for("connected anew with it", 1)) << farm_.Logs();
+  const RunResult asked = ask();
+  ASSERT_EQ(asked.exit_code, 0) << asked.err;
+  const RunResult submitted =
+      farm_.Client(farm_.WithCoordinator({"submit", SceneFile("cornell.gltf"), "--resolution",
+                                          "32x32", "--points", "300", "-o", farm_.File("a.exr")}) +
+                   TlsFlagsOf(certs_, "alice"));
+  EXPECT_EQ(submitted.exit_code, 0) << submitted.err << farm_.Logs();
+  // Files that do not fit together are told, and change nothing.
+  fs::copy_file(certs_ + "/alice.key", certs_ + "/server.key",
+                fs::copy_options::overwrite_existing);
+  ASSERT_TRUE(wait_for("cannot be used", 1)) << farm_.Logs();
+  EXPECT_EQ(ask().exit_code, 0);
 }
 
 TEST_F(SecurityTest, PlaintextIsRefusedInWordsThatItsSenderUnderstands) {

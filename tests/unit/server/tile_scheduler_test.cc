@@ -285,6 +285,37 @@ TEST_F(TileSchedulerTest, ABrokenConnectionCostsTheLeaseAtOnce) {
   EXPECT_EQ(scheduler_.Lease(other)->tile, grant->tile);
 }
 
+// A thousand random deaths hit some tile six times.
+TEST_F(TileSchedulerTest, WhereWorkersDieByTheHundredATileMayLoseMany) {
+  int number = 0;
+  const auto vanish = [&](int count) -> SchedulerNews {
+    std::vector<WorkerId> gone;
+    for (int i = 0; i < count; ++i) {
+      gone.push_back(AddWorker("w" + std::to_string(number++)));
+      EXPECT_TRUE(scheduler_.Lease(gone.back()).has_value());
+    }
+    clock_.Advance(options_.silence_time);
+    return scheduler_.Tick();
+  };
+  AddJob("elsewhere", 400);
+  vanish(300);
+  AddJob("a", 1, 10);
+  const uint32_t most = 4 * options_.max_tile_failures;
+  for (uint32_t i = 1; i <= most; ++i) {
+    EXPECT_EQ(vanish(1).set_aside.size(), i == most ? 1u : 0u) << i;
+  }
+  // What a worker says itself is no matter of the farm.
+  AddJob("b", 1, 20);
+  for (uint32_t i = 1; i <= options_.max_dead_workers; ++i) {
+    const WorkerId w = AddWorker("says so " + std::to_string(i));
+    const auto grant = scheduler_.Lease(w);
+    ASSERT_EQ(grant->job.value, "b");
+    const SchedulerNews news =
+        scheduler_.ReportFailure(w, grant->lease, false, absl::AbortedError("signal 11"));
+    EXPECT_EQ(news.set_aside.size(), i == options_.max_dead_workers ? 1u : 0u) << i;
+  }
+}
+
 TEST_F(TileSchedulerTest, WhoComesBackDidNotDieOfItsTile) {
   AddJob("a", 1);
   const WorkerId keeper = AddWorker("keeper", "another arithmetic");
