@@ -49,7 +49,7 @@ absl::StatusOr<Workload> Make(const std::string& name, const SceneChanges& chang
   LightCounters counters;
   uint64_t path_rays = 0;
   for (size_t i = 0; i < work.receivers.size(); ++i) {
-    TraceIndirect(*recorder, lights, work.receivers[i], kPaths, HashKey(kSeed, i), counters,
+    TraceIndirect(*recorder, lights, work.receivers[i], kPaths, 1, HashKey(kSeed, i), counters,
                   path_rays);
   }
   // A shadow ray that ends where it starts counts, but is not traced.
@@ -75,7 +75,7 @@ void AgainstEmbree(benchmark::State& state, const std::string& name, const Scene
     uint64_t rays = 0;
     for (size_t i = 0; i < work->receivers.size(); ++i) {
       benchmark::DoNotOptimize(TraceIndirect(*work->accel, *work->lights, work->receivers[i],
-                                             kPaths, HashKey(kSeed, i), counters, rays));
+                                             kPaths, 1, HashKey(kSeed, i), counters, rays));
     }
     const double middle = ThreadCpuSeconds();
     const size_t hits = work->accel->TraceBare(work->rays);

@@ -558,6 +558,7 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
   if (wire.has_spp()) settings.spp = wire.spp();
   if (wire.has_paths()) settings.paths = wire.paths();
   if (wire.has_light_samples()) settings.light_samples = wire.light_samples();
+  if (wire.has_bounces()) settings.bounces = wire.bounces();
   if (wire.has_points()) settings.points = wire.points();
   if (wire.has_microbuffer_px()) settings.microbuffer = wire.microbuffer_px();
   if (wire.has_clusters()) settings.clusters = wire.clusters();
@@ -647,6 +648,7 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
   wire.set_spp(settings.spp);
   wire.set_paths(settings.paths);
   wire.set_light_samples(settings.light_samples);
+  wire.set_bounces(settings.bounces);
   wire.set_points(settings.points);
   wire.set_microbuffer_px(settings.microbuffer);
   wire.set_clusters(settings.clusters);

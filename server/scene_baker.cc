@@ -128,6 +128,7 @@ Digest BakeKey(const JobSpec& spec) {
   s.filter = any.filter;
   s.filter_width_px = any.filter_width_px;
   s.paths = any.paths;
+  if (!s.point_based()) s.bounces = any.bounces;
   s.microbuffer = any.microbuffer;
   s.buffer_map = any.buffer_map;
   s.splat = any.splat;

@@ -18,7 +18,7 @@ namespace {
 
 constexpr uint32_t kTopologyMagic = 0x54545046;  // "FPTT"
 constexpr uint32_t kRadianceMagic = 0x52545046;  // "FPTR"
-constexpr uint32_t kVersion = 3;
+constexpr uint32_t kVersion = 4;
 constexpr size_t kHeaderBytes = 16;  // magic, version, number of surfels
 constexpr size_t kPiece = 4096;
 constexpr int kHilbertBits = 16;
@@ -508,14 +508,25 @@ Blob PointTree::BuildRadiance(const Topology& topology, const SurfelCloud& cloud
   for (const float b : brightest_in) brightest = std::max(brightest, b);
   const RadianceUnit unit = RadianceUnit::For(brightest);
 
+  // Irradiance after further bounces, for the surfels alone.
+  const bool bounced = !shading.indirect_front.empty();
+  FP_CHECK(!bounced || (shading.indirect_front.size() == n && shading.indirect_back.size() == n));
+  float most_indirect = 0;
+  for (size_t i = 0; bounced && i < n; ++i) {
+    most_indirect = std::max({most_indirect, MaxComponent(shading.indirect_front[i]),
+                              MaxComponent(shading.indirect_back[i])});
+  }
+  const RadianceUnit indirect_unit = RadianceUnit::For(most_indirect);
+
   auto record = Header(kRadianceMagic, n,
-                       5 * kBlobAlignment + lit_sides.size() * sizeof(uint32_t) +
-                           levels.groups * sizeof(PackedRadiance));
-  const float unit_value = unit.unit();
-  record.resize(record.size() + sizeof unit_value);
-  std::memcpy(record.data() + kHeaderBytes, &unit_value, sizeof unit_value);
+                       7 * kBlobAlignment + lit_sides.size() * sizeof(uint32_t) +
+                           (levels.groups + (bounced ? leaf_groups : 0)) * sizeof(PackedRadiance));
+  const float units[2] = {unit.unit(), indirect_unit.unit()};
+  record.resize(record.size() + sizeof units);
+  std::memcpy(record.data() + kHeaderBytes, units, sizeof units);
   std::copy(lit_sides.begin(), lit_sides.end(), AddArray<uint32_t>(record, lit_sides.size()));
   PackedRadiance* const radiance = AddArray<PackedRadiance>(record, levels.groups);
+  PackedRadiance* const indirect = AddArray<PackedRadiance>(record, bounced ? leaf_groups : 0);
 
   BulkVector<RadianceNode> here(leaf_groups), above;
   executor.ForEachPiece(leaf_groups, kPiece / kLanes, [&](size_t begin, size_t end) {
@@ -532,6 +543,13 @@ Blob PointTree::BuildRadiance(const Topology& topology, const SurfelCloud& cloud
       }
       radiance[g] = PackRadiance(surfels, count, unit);
       here[g] = MeanRadiance(surfels, count);
+      if (!bounced) continue;
+      for (uint32_t k = 0; k < count; ++k) {
+        const uint32_t i = topology.order[g * kLanes + k];
+        surfels[k].front = shading.indirect_front[i];
+        surfels[k].back = shading.indirect_back[i];
+      }
+      indirect[g] = PackRadiance(surfels, count, indirect_unit);
     }
   });
   for (size_t level = 1; level < levels.sizes.size(); ++level) {
@@ -682,11 +700,13 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
                                ", this program reads version " + std::to_string(kVersion));
   }
   FP_RETURN_IF_ERROR(light.Get(n_radiance, "surfel count"));
-  float unit = 0;
+  float unit = 0, indirect_unit = 0;
   FP_RETURN_IF_ERROR(light.Get(unit, "unit of radiance"));
+  FP_RETURN_IF_ERROR(light.Get(indirect_unit, "unit of indirect irradiance"));
   std::span<const uint32_t> lit_sides;
   FP_RETURN_IF_ERROR(light.GetArray(lit_sides, "lit sides"));
   FP_RETURN_IF_ERROR(light.GetArray(tree->radiance_, "groups"));
+  FP_RETURN_IF_ERROR(light.GetArray(tree->indirect_, "groups of indirect irradiance"));
   FP_RETURN_IF_ERROR(light.ExpectEnd());
 
   if (n > (uint64_t{1} << 31) || n != n_radiance) {
@@ -706,8 +726,15 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
                                std::to_string(tree->surfels_.size() + tree->nodes_.size()) +
                                " and radiance of " + std::to_string(tree->radiance_.size()));
   }
+  if (!tree->indirect_.empty() && tree->indirect_.size() != levels.leaf_groups()) {
+    return absl::DataLossError("point tree of " + std::to_string(n) + " surfels has " +
+                               std::to_string(tree->indirect_.size()) +
+                               " groups of indirect irradiance; it should have none or " +
+                               std::to_string(levels.leaf_groups()));
+  }
   // One pass over the numbers: kernels trust them afterwards.
-  bool sane = IsPowerOfTwo(unit, 0x1p-126f, 0x1p88f);
+  bool sane =
+      IsPowerOfTwo(unit, 0x1p-126f, 0x1p88f) && IsPowerOfTwo(indirect_unit, 0x1p-126f, 0x1p88f);
   for (size_t level = 0; level < levels.sizes.size(); ++level) {
     const size_t groups = GroupsFor(levels.sizes[level]);
     for (size_t g = 0; g < groups; ++g) {
@@ -726,6 +753,7 @@ absl::StatusOr<std::shared_ptr<const PointTree>> PointTree::FromBlobs(Blob topol
   }
   tree->surfel_count_ = n;
   tree->unit_ = RadianceUnit(unit);
+  tree->indirect_unit_ = RadianceUnit(indirect_unit);
   tree->lit_ = (light_bits & kMantissas) != 0;
   FP_RETURN_IF_ERROR(tree->AddVisible(lit_sides));
   tree->FindExtremes();

@@ -116,6 +116,18 @@ class PointTree {
     const PackedRadiance& r = radiance_[slot / kLanes];
     return unit_.Unpack((front ? r.front : r.back)[slot % kLanes]);
   }
+  // Whether surfels gathered from surfels; if not, indirect_of must not be asked.
+  bool has_indirect() const { return !indirect_.empty(); }
+  // The irradiance [W/m²] that further bounces bring to a side of a surfel: a part of what it
+  // reflects.
+  Rgb indirect_of(uint32_t slot, bool front) const {
+    const PackedRadiance& r = indirect_[slot / kLanes];
+    return indirect_unit_.Unpack((front ? r.front : r.back)[slot % kLanes]);
+  }
+  // Bit 0: the front of a surfel is visible; bit 1: its back.
+  unsigned visible_sides(uint32_t slot) const {
+    return surfels_[slot / kLanes].normal[slot % kLanes] >> 30;
+  }
   RadianceGroup radiance(uint32_t g) const {
     RadianceGroup sides;
     for (uint32_t k = 0; k < kLanes; ++k) sides.lane[k] = radiance_of(g * kLanes + k);
@@ -146,8 +158,8 @@ class PointTree {
   std::vector<uint32_t> first_group_;       // by level
   std::span<const PackedSurfels> surfels_;  // groups of level 0
   std::span<const PackedNodes> nodes_;      // of the others
-  std::span<const PackedRadiance> radiance_;
-  RadianceUnit unit_;
+  std::span<const PackedRadiance> radiance_, indirect_;
+  RadianceUnit unit_, indirect_unit_;
   bool lit_ = false;
   float largest_radius_m_ = 0, most_layers_ = 1;
 };

@@ -32,6 +32,8 @@ using SurfelSides = std::vector<uint8_t>;
 struct SurfelShading {
   BulkVector<Rgb> front, back;  // reflected radiance, W/(m² sr), diffuse: the same all round
   SurfelSides visible_sides;    // those that are open, and those that a light reaches
+  // What of it is not direct: irradiance after further bounces, W/m². Empty: one bounce.
+  BulkVector<Rgb> indirect_front, indirect_back;
 };
 
 }  // namespace farpoint

@@ -17,19 +17,35 @@
 
 namespace farpoint {
 
+// What is asked of surfels.
+enum class SurfelValue {
+  kRadiance,  // that they reflect, W/(m² sr)
+  kIndirect,  // the irradiance after further bounces, W/m²: smooth where direct light is not
+};
+
 // The surfel nearest to a point, by a hash grid over the tree's surfels. Immutable; thread-safe.
 class SurfelGrid {
  public:
-  // `tree` must outlive the grid.
-  explicit SurfelGrid(const PointTree& tree);
+  // `tree` must outlive the grid; for kIndirect it must have it.
+  explicit SurfelGrid(const PointTree& tree, SurfelValue value = SurfelValue::kRadiance);
 
   // The radiance [W/(m² sr)] on the front (`n`, unit) or back of a surface at `p`: that of the
   // nearest surfel within 1.5 spacings whose plane is within 60° of n's and passes within a tenth
   // of a spacing of p, of those that look along n if there are any, else of those that look
   // against it; none if there is none, and where those within one spacing differ more than
   // fourfold.
+  // kIndirect: the irradiance of the surfel of FindVisible.
   // `where`: none, or gets the surfel's position.
   std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front, Vec3f* where = nullptr) const;
+
+  struct Side {
+    uint32_t slot;
+    bool front;
+  };
+  // The nearest surfel by Find's rules, whatever it reflects, whose side there is visible: what
+  // something stands on is not. `where` as for Find.
+  std::optional<Side> FindVisible(const Vec3f& p, const Vec3f& n, bool front,
+                                  Vec3f* where = nullptr) const;
 
   // sqrt(mean area of a surfel); 0 for an empty tree.
   float spacing_m() const { return spacing_m_; }
@@ -40,7 +56,7 @@ class SurfelGrid {
     Vec3f position;
     uint32_t slot;
     Vec3f normal;
-    float front, back;  // the sum of the radiance's channels
+    float front, back;  // the sum of the value's channels
   };
   struct Cell {
     uint64_t key = kEmpty;
@@ -48,8 +64,13 @@ class SurfelGrid {
   };
   static constexpr uint64_t kEmpty = ~uint64_t{0};
   const Cell* FindCell(uint64_t key) const;
+  // Calls `see` with each entry of the cells about p that Find's rules admit: the squared distance,
+  // and 0 if it looks along n, else 1.
+  template <typename See>
+  void ForEachNear(const Vec3f& p, const Vec3f& n, const See& see) const;
 
   const PointTree& tree_;
+  SurfelValue value_;
   float spacing_m_ = 0, inverse_cell_ = 0;
   Vec3f low_;
   std::vector<Entry> entries_;  // cell by cell
@@ -63,7 +84,8 @@ class SurfelAtlas {
   // The tree must be of the accelerated scene; both must outlive the atlas. 16 bytes a texel, of
   // memory that is touched when it is read; at most kMaxTexels (then texels are larger than
   // surfels).
-  SurfelAtlas(const RayAccel& accel, const PointTree& tree);
+  // `radiance`: null, or an atlas of kRadiance that outlives this one of kIndirect.
+  SurfelAtlas(const RayAccel& accel, const PointTree& tree, const SurfelAtlas* radiance = nullptr);
 
   // The point (b1, b2) of `triangle`, on the side of its front (winding) or back.
   struct Point {
@@ -73,7 +95,8 @@ class SurfelAtlas {
   };
   // The radiance at a point, as SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits
   // below the largest channel. None, too, where something stands on the texel, or between it and
-  // the surfel: the light on its other side is another.
+  // the surfel: the light on its other side is another. Of kIndirect the irradiance; where no
+  // surfel has it for the texel, that which kTexelRays rays from its centre bring.
   std::optional<Rgb> Radiance(const Point& point) const;
   // The same of up to kTogether points, whose fetches from memory overlap: bit i is set where there
   // is one at points[i].
@@ -83,6 +106,7 @@ class SurfelAtlas {
 
   float spacing_m() const { return grid_.spacing_m(); }
 
+  static constexpr uint32_t kTexelRays = 32;
   static constexpr uint64_t kMaxTexels = uint64_t{1} << 28;
 
  private:
@@ -98,11 +122,15 @@ class SurfelAtlas {
   };
   Texel TexelOf(const Point& point, const Patch& patch) const;
   uint64_t Resolve(const Point& point, const Texel& texel, uint32_t side) const;
+  bool CutOff(const Vec3f& from, const Vec3f& to) const;
+  // The irradiance at p on the side of `out`, read where rays end.
+  Rgb Gathered(const Point& point, const Vec3f& p, const Vec3f& out, uint64_t key) const;
   // The word, resolved if need be.
   uint64_t Value(const Point& point, const Texel& texel, uint32_t side) const;
 
   const RayAccel& accel_;
   const PreparedScene& scene_;
+  const SurfelAtlas* const radiance_;
   SurfelGrid grid_;
   std::vector<Patch> patches_;  // by triangle
   // Two words a texel, front and back: 0: not resolved yet; see the .cc.

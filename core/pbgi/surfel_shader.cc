@@ -18,14 +18,6 @@ struct PieceCounts {
   uint64_t shadow = 0, interior = 0, inside = 0, black = 0, away = 0, environments = 0;
 };
 
-// Seeds a surfel's rays by what it is, not by where it stands in the cloud.
-uint64_t KeyOf(const SurfelCloud& cloud, size_t i, const PreparedScene& scene, uint64_t seed) {
-  const uint32_t t = cloud.triangle[i];
-  const PreparedObject& object = scene.objects()[scene.triangles()[t].object];
-  return HashKey(seed, object.content_key, t - object.first_triangle,
-                 static_cast<uint64_t>(cloud.barycentric[i].x * 16777216.0f));
-}
-
 // Sets of kInteriorRays directions about +z, stratified by the cosine. Drawing from a table costs
 // nothing beside the ray.
 constexpr size_t kInteriorSets = 256;
@@ -70,6 +62,13 @@ bool SeesOnlyBackFaces(const RayAccel& accel, const std::vector<Vec3f>& normals,
 
 }  // namespace
 
+uint64_t SurfelKey(const SurfelCloud& cloud, size_t i, const PreparedScene& scene, uint64_t seed) {
+  const uint32_t t = cloud.triangle[i];
+  const PreparedObject& object = scene.objects()[scene.triangles()[t].object];
+  return HashKey(seed, object.content_key, t - object.first_triangle,
+                 static_cast<uint64_t>(cloud.barycentric[i].x * 16777216.0f));
+}
+
 SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint64_t seed,
                           Executor& executor, Stats& stats) {
   static const std::array<InteriorSet, kInteriorSets> sets = MakeInteriorSets();
@@ -81,7 +80,7 @@ SurfelSides FindOpenSides(const SurfelCloud& cloud, const RayAccel& accel, uint6
   executor.ForEachPiece(n, kPiece, [&](size_t begin, size_t end) {
     PieceCounts& counts = piece_counts[begin / kPiece];
     for (size_t i = begin; i < end; ++i) {
-      const uint64_t key = KeyOf(cloud, i, accel.scene(), seed);
+      const uint64_t key = SurfelKey(cloud, i, accel.scene(), seed);
       uint8_t open = 0;
       for (unsigned side = 0; side < 2; ++side) {
         const Vec3f ng = side == 0 ? cloud.normal[i] : -cloud.normal[i];
@@ -123,7 +122,7 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
       const Rgb albedo = scene.Surface(t, b.x, b.y).albedo;
       const Vec3f ns_front = scene.ShadingNormal(t, b.x, b.y);
       const bool black = !(MaxComponent(albedo) > 0.0f);
-      const uint64_t key = KeyOf(cloud, i, scene, options.seed);
+      const uint64_t key = SurfelKey(cloud, i, scene, options.seed);
       uint8_t visible = open_sides[i];
       for (unsigned side = 0; side < 2; ++side) {
         const uint8_t bit = side == 0 ? kFrontVisible : kBackVisible;

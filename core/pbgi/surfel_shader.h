@@ -19,6 +19,9 @@ struct ShadeOptions {
 // A gather averages many surfels, so each takes a quarter of a receiver's shadow rays.
 inline constexpr uint32_t kSurfelLightShare = 4;
 
+// Seeds a surfel's rays by what it is, not by where it stands in the cloud.
+uint64_t SurfelKey(const SurfelCloud& cloud, size_t i, const PreparedScene& scene, uint64_t seed);
+
 // The sides that are open: not inside a closed object as far as four rays that leave the side tell
 // (all of them hit back faces). A matter of geometry alone, whatever the lights. Surfels are
 // independent of each other: any number of threads gives the same result. Adds the count

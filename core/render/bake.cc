@@ -11,6 +11,7 @@
 #include "core/base/clock.h"
 #include "core/light/light_sampler.h"
 #include "core/pbgi/point_tree.h"
+#include "core/pbgi/surfel_bounces.h"
 #include "core/pbgi/surfel_sampler.h"
 #include "core/pbgi/surfel_shader.h"
 #include "core/scene/prepared_scene.h"
@@ -182,6 +183,7 @@ class TreeBake {
     topology_key_ = topology.Finish();
     Sha256 radiance;
     radiance.Update("radiance").UpdateU64(settings_.seed).UpdateU32(settings_.light_samples);
+    radiance.UpdateU32(settings_.bounces);
     HashDigest(radiance, topology_key_);
     HashDigest(radiance, prepared_->blob().Hash());
     radiance_key_ = radiance.Finish();
@@ -235,6 +237,15 @@ class TreeBake {
       options.needless = NeedlessLightOf(settings_);
       shading =
           ShadeSurfels(cloud, topology->open_sides, *accel, *lights, options, executor_, stats_);
+    }
+    if (settings_.bounces > 1 && cloud.size() > 0) {
+      FP_RETURN_IF_ERROR(CheckNotStopped());
+      StageTimer timer(stats_, Stage::kShade);
+      BounceOptions options;
+      options.bounces = settings_.bounces;
+      options.seed = settings_.seed;
+      FP_RETURN_IF_ERROR(AddBounces(cloud, topology->open_sides, topology->topology, *accel,
+                                    *lights, options, executor_, shading, stats_));
     }
     FP_RETURN_IF_ERROR(CheckNotStopped());
     StageTimer timer(stats_, Stage::kTree);

@@ -494,7 +494,7 @@ class Renderer final : public FrameRenderer {
       Pulse();
       if (!wanted[r]) continue;
       const TracedIrradiance traced = TraceIndirect(
-          *scene_.accel, *scene_.lights, receivers[r], settings_.paths,
+          *scene_.accel, *scene_.lights, receivers[r], settings_.paths, settings_.bounces,
           HashKey(PixelKey(block, sample_of[r], kKeyPath), sample_of[r] % settings_.spp), counters,
           n.rays, NeedlessLightOf(settings_), !settings_.skips(kSkipBlack));
       samples[sample_of[r]].indirect_e = traced.irradiance;

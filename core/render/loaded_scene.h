@@ -24,10 +24,17 @@ class LoadedSceneData final : public LoadedScene {
     std::call_once(atlas_once_, [this] { atlas_ = std::make_unique<SurfelAtlas>(*accel, *tree); });
     return *atlas_;
   }
+  // The same of what further bounces bring. Null: the tree has one bounce.
+  const SurfelAtlas* IndirectAtlas() const {
+    if (!tree->has_indirect()) return nullptr;
+    std::call_once(indirect_once_,
+                   [this] { indirect_ = std::make_unique<SurfelAtlas>(*accel, *tree, &Atlas()); });
+    return indirect_.get();
+  }
 
  private:
-  mutable std::once_flag atlas_once_;
-  mutable std::unique_ptr<const SurfelAtlas> atlas_;
+  mutable std::once_flag atlas_once_, indirect_once_;
+  mutable std::unique_ptr<const SurfelAtlas> atlas_, indirect_;
 };
 
 }  // namespace farpoint

@@ -24,9 +24,9 @@ uint32_t FirstOf(uint32_t batch, uint32_t paths) {
 }  // namespace
 
 TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights,
-                               const Receiver& receiver, uint32_t paths, uint64_t key,
-                               LightCounters& counters, uint64_t& rays, unsigned needless,
-                               bool keep_black) {
+                               const Receiver& receiver, uint32_t paths, uint32_t bounces,
+                               uint64_t key, LightCounters& counters, uint64_t& rays,
+                               unsigned needless, bool keep_black) {
   const PreparedScene& scene = accel.scene();
   const Frame8 frame{V8(receiver.normal)};
   const V8 ng(receiver.geometric_normal);
@@ -35,7 +35,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
   const OwenSobolAxis axis_u(0, seed), axis_v(1, seed);
   const uint64_t light_key = HashKey(key, 12);
   Vec3d batch[kBatches];
-  uint32_t b = 0, next_batch = FirstOf(1, paths);
+  const auto batch_of = [&](uint32_t path) { return uint64_t{path} * kBatches / paths; };
   RayHits hits;
   const U8 lanes = {0, 1, 2, 3, 4, 5, 6, 7};
   for (uint32_t first = 0; first < paths; first += kRaysTogether) {
@@ -50,38 +50,61 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
       for (uint32_t l = 0; l < kHitLanes; ++l) directions[k + l] = w.Lane(l);
     }
     if (count < kRaysTogether) leaving &= (uint64_t{1} << count) - 1;
-    rays += static_cast<uint64_t>(std::popcount(leaving));
-    hits.count = 0;
-    for (; leaving != 0; leaving &= leaving - 1) {
-      const auto k = static_cast<uint32_t>(std::countr_zero(leaving));
-      const std::optional<RayHit> hit = accel.Intersect(origin, directions[k]);
-      if (!hit) continue;
-      const uint32_t i = hits.count++;
-      hits.ray[i] = k;
-      hits.index[i] = first + k;
-      hits.triangle[i] = hit->triangle;
-      hits.b1[i] = hit->b1;
-      hits.b2[i] = hit->b2;
-    }
-    for (uint32_t i = 0; i < hits.count; ++i) hits.direction.Set(i, directions[hits.ray[i]]);
-    const uint32_t met = hits.count;
-    KeepWhatReflects(scene, hits, keep_black);
-    counters.skipped_black += met - hits.count;
-    std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
-    std::array<V8, kRaysTogether / kHitLanes> irradiance;
-    const size_t groups = (hits.count + kHitLanes - 1) / kHitLanes;
-    for (uint32_t g = 0; g < groups; ++g) {
-      points[g] = SurfaceAt(hits, g * kHitLanes);
-      points[g].active = (1u << std::min(kHitLanes, hits.count - g * kHitLanes)) - 1u;
-    }
-    lights.IrradianceEach(std::span(points).first(groups), light_key, 2,
-                          std::span(irradiance).first(groups), counters, needless);
-    for (uint32_t i = 0; i < hits.count; ++i) {
-      const Rgb arriving = irradiance[i / kHitLanes].Lane(i % kHitLanes);
-      // Textures are looked up where light arrives only.
-      if (!(MaxComponent(arriving) > 0.0f)) continue;
-      while (hits.index[i] >= next_batch) next_batch = FirstOf(++b + 1, paths);
-      batch[b] += Vec3d(scene.Surface(hits.triangle[i], hits.b1[i], hits.b2[i]).albedo * arriving);
+    std::array<Vec3f, kRaysTogether> origins;
+    std::array<Rgb, kRaysTogether> throughput;  // of the paths, before the vertex at hand
+    origins.fill(origin);
+    throughput.fill(Rgb(1));
+    for (uint32_t bounce = 1; leaving != 0; ++bounce) {
+      const auto order_seed = static_cast<uint32_t>(HashKey(key, 13, bounce));
+      rays += static_cast<uint64_t>(std::popcount(leaving));
+      hits.count = 0;
+      for (; leaving != 0; leaving &= leaving - 1) {
+        const auto k = static_cast<uint32_t>(std::countr_zero(leaving));
+        const std::optional<RayHit> hit = accel.Intersect(origins[k], directions[k]);
+        if (!hit) continue;
+        const uint32_t i = hits.count++;
+        hits.ray[i] = k;
+        // Scrambles of the same points keep their order of strata: later bounces see the points
+        // in another order, or paths would not fill the space of their directions.
+        hits.index[i] = bounce == 1 ? first + k : OwenShuffledIndex(first + k, order_seed);
+        hits.triangle[i] = hit->triangle;
+        hits.b1[i] = hit->b1;
+        hits.b2[i] = hit->b2;
+      }
+      for (uint32_t i = 0; i < hits.count; ++i) hits.direction.Set(i, directions[hits.ray[i]]);
+      const uint32_t met = hits.count;
+      KeepWhatReflects(scene, hits, keep_black);
+      counters.skipped_black += met - hits.count;
+      std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
+      std::array<V8, kRaysTogether / kHitLanes> irradiance;
+      const size_t groups = (hits.count + kHitLanes - 1) / kHitLanes;
+      for (uint32_t g = 0; g < groups; ++g) {
+        points[g] = SurfaceAt(hits, g * kHitLanes);
+        points[g].active = (1u << std::min(kHitLanes, hits.count - g * kHitLanes)) - 1u;
+      }
+      lights.IrradianceEach(std::span(points).first(groups),
+                            bounce == 1 ? light_key : HashKey(light_key, bounce), 2,
+                            std::span(irradiance).first(groups), counters, needless);
+      const bool last = bounce >= bounces;
+      const auto next_order_seed = static_cast<uint32_t>(HashKey(key, 13, bounce + 1));
+      const auto next_seed = static_cast<uint32_t>(HashKey(key, 11, bounce));
+      for (uint32_t i = 0; i < hits.count; ++i) {
+        const Rgb arriving = irradiance[i / kHitLanes].Lane(i % kHitLanes);
+        // Textures are looked up where light arrives, or the path goes on.
+        if (last && !(MaxComponent(arriving) > 0.0f)) continue;
+        const uint32_t k = hits.ray[i];
+        throughput[k] *= scene.Surface(hits.triangle[i], hits.b1[i], hits.b2[i]).albedo;
+        batch[batch_of(first + k)] += Vec3d(throughput[k] * arriving);
+        if (last || !(MaxComponent(throughput[k]) > 0.0f)) continue;
+        const SurfacePoint at = points[i / kHitLanes].Lane(i % kHitLanes);
+        const uint32_t index = OwenShuffledIndex(first + k, next_order_seed);
+        const Vec3f w = Frame(at.n).ToWorld(
+            CosineHemisphere(OwenSobol(index, 0, next_seed), OwenSobol(index, 1, next_seed)));
+        if (!(Dot(w, at.ng) > 0.0f)) continue;
+        origins[k] = at.Leave();
+        directions[k] = w;
+        leaving |= uint64_t{1} << k;
+      }
     }
   }
   TracedIrradiance out;

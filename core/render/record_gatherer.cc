@@ -30,10 +30,11 @@ enum : uint64_t { kKeyDirections = 31, kKeyLight = 32, kKeyPilot = 33, kKeyPilot
 // What one receiver sees along rays.
 class HitReader {
  public:
-  HitReader(const LoadedSceneData& scene, const SurfelAtlas* atlas, float near_m,
-            const Receiver& receiver, uint64_t light_key)
+  HitReader(const LoadedSceneData& scene, const SurfelAtlas* atlas, const SurfelAtlas* indirect,
+            float near_m, const Receiver& receiver, uint64_t light_key)
       : scene_(scene),
         atlas_(atlas),
+        indirect_(indirect),
         near_m_(near_m),
         origin_(receiver.Leave()),
         offset_m_(receiver.offset_m),
@@ -139,8 +140,18 @@ class HitReader {
     }
     scene_.lights->IrradianceEach(std::span(points).first(groups), light_key_, 2,
                                   std::span(irradiance).first(groups), counters);
+    std::array<Rgb, kRaysTogether> indirect;
+    uint64_t found = 0;
+    if (indirect_ != nullptr) {
+      std::array<SurfelAtlas::Point, kRaysTogether> at;
+      for (uint32_t k = 0; k < near.count; ++k) {
+        at[k] = {near.triangle[k], near.b1[k], near.b2[k], hits[near.ray[k]].front};
+      }
+      found = indirect_->Radiances(std::span(at).first(near.count), indirect);
+    }
     for (uint32_t k = 0; k < near.count; ++k) {
-      const Rgb arriving = irradiance[k / kHitLanes].Lane(k % kHitLanes);
+      Rgb arriving = irradiance[k / kHitLanes].Lane(k % kHitLanes);
+      if ((found >> k & 1) != 0) arriving += indirect[k];
       // Textures are looked up where light arrives only.
       if (!(MaxComponent(arriving) > 0.0f)) continue;
       const Rgb albedo = scene.Surface(near.triangle[k], near.b1[k], near.b2[k]).albedo;
@@ -150,6 +161,7 @@ class HitReader {
 
   const LoadedSceneData& scene_;
   const SurfelAtlas* const atlas_;
+  const SurfelAtlas* const indirect_;
   const float near_m_;
   const Vec3f origin_;
   const float offset_m_;
@@ -264,6 +276,7 @@ RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& r
   if (settings.point_based() && settings.fill_in_force() == Fill::kRays && scene.tree != nullptr &&
       !scene.tree->empty()) {
     atlas_ = &scene.Atlas();
+    indirect_ = scene.IndirectAtlas();
     near_m_ = kNearSpacings * atlas_->spacing_m();
   }
 }
@@ -350,7 +363,7 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
   HemisphereSamples samples(grid);
   const uint64_t directions_key = HashKey(key, kKeyDirections);
   grid.Directions(directions_key, samples.direction(0), samples.direction(1), samples.direction(2));
-  HitReader reader(scene_, atlas_, near_m_, receiver, HashKey(key, kKeyLight));
+  HitReader reader(scene_, atlas_, indirect_, near_m_, receiver, HashKey(key, kKeyLight));
   HitReader::Rays rays;
   // Reads the rays, once again those that bring so much more than the others that one which slipped
   // between two triangles would show, and hands them to `take`.

@@ -59,10 +59,11 @@ class RecordGatherer final : public PlaceSource {
   const MicrobufferMap& map_;
   const CutParams& cut_params_;
   const bool sees_sky_;
-  const SurfelAtlas* atlas_ = nullptr;  // null: shade every hit
-  Means least_share_;                   // of standard deviation, for a ray more; 0: none
-  bool hide_ = true;                    // leave out of cuts what is hidden
-  float near_m_ = 0;                    // hits nearer than this are shaded afresh
+  const SurfelAtlas* atlas_ = nullptr;     // null: shade every hit
+  const SurfelAtlas* indirect_ = nullptr;  // what shaded hits get by further bounces; null: one
+  Means least_share_;                      // of standard deviation, for a ray more; 0: none
+  bool hide_ = true;                       // leave out of cuts what is hidden
+  float near_m_ = 0;                       // hits nearer than this are shaded afresh
   mutable std::mutex mutex_;
   mutable Stats stats_;
 };

@@ -77,6 +77,11 @@ absl::Status ValidateSettings(const RenderSettings& s) {
     return absl::InvalidArgumentError("filter-width must be between 0.01 and 16 pixels");
   }
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("paths", s.paths, 1, 1u << 20));
+  FP_RETURN_IF_ERROR(CheckRange<uint32_t>("bounces", s.bounces, 1, kMostBounces));
+  if (s.bounces > 1 && s.integrator == Integrator::kIrrcache) {
+    return absl::InvalidArgumentError(
+        "irrcache gathers one bounce; leave bounces at 1, or use fpbgi, pbgi, dpbgi or pt");
+  }
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("light-samples", s.light_samples, 1, 4096));
   FP_RETURN_IF_ERROR(CheckRange<uint64_t>("points", s.points, 0, uint64_t{1} << 31));
   FP_RETURN_IF_ERROR(CheckRange<uint32_t>("microbuffer", s.microbuffer, 0, 256));

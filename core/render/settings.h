@@ -49,6 +49,8 @@ enum SkipMask : uint32_t {
   kSkipBakeStages = 1u << 9,     // whose product an earlier bake left
 };
 
+inline constexpr uint32_t kMostBounces = 64;
+
 struct RenderSettings {
   // --- Changes the image ---
   Integrator integrator = Integrator::kFpbgi;
@@ -56,6 +58,7 @@ struct RenderSettings {
   PixelFilter filter = PixelFilter::kBlackmanHarris;  // of no effect at spp 1
   float filter_width_px = 0;    // of its whole support, 0.01..16; 0: the filter's default
   uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
+  uint32_t bounces = 1;         // of indirect light, 1..kMostBounces; irrcache knows one
   uint32_t light_samples = 32;  // shadow rays per receiver, see docs/lights.md, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
   uint32_t microbuffer = 0;     // side of the buffer in pixels, 1..256; 0: the map's default

@@ -159,7 +159,7 @@ TEST_F(Refusal, OfWrongUsageIsExitCode2) {
            {"render", good, "-o", "a.exr", "--fill", "x"},
            {"render", good, "-o", "a.exr", "--integrator", "radiosity"},
            {"render", good, "-o", "a.exr", "--clusters", "adapt"},
-           {"render", good, "-o", "a.exr", "--bounces", "2"},
+           {"render", good, "-o", "a.exr", "--bounces", "0"},
            {"render", good, "-o", "a.exr", "--eye", "0,0,0"},
            {"render", "scene.fbx", "-o", "a.exr"},
            {"submit", good, "-o", "a.exr"},

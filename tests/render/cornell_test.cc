@@ -35,6 +35,31 @@ TEST(Cornell, PointBasedIntegratorsAgreeWithThePathTracer) {
   }
 }
 
+TEST(Cornell, FurtherBouncesAgreeWithThePathTracer) {
+  const Scene scene = MakeCornellBox();
+  FilmSpec film = Whole(128, 128);
+  film.crop = {32, 48, 64, 80};  // walls, an edge of the tall block, the corner behind it
+  for (const uint32_t bounces : {2u, 6u}) {
+    SCOPED_TRACE(bounces);
+    RenderSettings pt = Settings(Integrator::kPt);
+    pt.paths = 2048;
+    pt.bounces = bounces;
+    const Rendered truth = RenderScene(scene, scene.cameras[0], film, pt);
+    for (const Integrator integrator : {Integrator::kPbgi, Integrator::kFpbgi}) {
+      RenderSettings s = Settings(integrator);
+      s.points = 30000;
+      s.bounces = bounces;
+      const Rendered r = RenderScene(scene, scene.cameras[0], film, s);
+      const ErrorOfLayer error = Compare(r.film, truth.film, Layer::kIrradiance);
+      EXPECT_LE(error.rr, integrator == Integrator::kPbgi ? 0.08 : 0.05) << NameOf(integrator);
+      EXPECT_LE(std::fabs(error.bias), 0.03) << NameOf(integrator);
+      s.bounces = 1;
+      const Rendered one = RenderScene(scene, scene.cameras[0], film, s);
+      EXPECT_LT(Compare(one.film, truth.film, Layer::kIrradiance).bias, -0.1);
+    }
+  }
+}
+
 TEST(Cornell, PaperPresetAgreesRoughly) {
   const Scene scene = MakeCornellBox();
   RenderSettings pt = Settings(Integrator::kPt);

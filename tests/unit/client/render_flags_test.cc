@@ -286,7 +286,7 @@ INSTANTIATE_TEST_SUITE_P(
         BadValue{"--clusters", "adapt", "adaptive"}, BadValue{"--clusters", "0", "1..1024"},
         BadValue{"--clusters", "1025", "clusters"}, BadValue{"--epsilon", "-0.1", "at least 0"},
         BadValue{"--epsilon", "nan", "finite"}, BadValue{"--epsilon", "inf", "finite"},
-        BadValue{"--bounces", "2", "one bounce"}, BadValue{"--bounces", "0", "one bounce"},
+        BadValue{"--bounces", "65", "bounces"}, BadValue{"--bounces", "0", "bounces"},
         BadValue{"--tile", "100", "multiple"}, BadValue{"--tile", "0", "multiple"},
         BadValue{"--aov", "irradience", "irradiance"}, BadValue{"--aov", "", "unknown layer"},
         BadValue{"--aov", "stderr", "pt"}, BadValue{"--preset", "fast", "paper"},

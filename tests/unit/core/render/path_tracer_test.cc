@@ -27,10 +27,11 @@ struct World {
   Receiver At(const Vec3d& p_world, const Vec3f& n) const {
     return {Vec3f(p_world - scene().origin()), n, n, false, scene().diagonal_m() * 0x1p-19f};
   }
-  TracedIrradiance Trace(const Receiver& r, uint32_t paths, uint64_t key) const {
+  TracedIrradiance Trace(const Receiver& r, uint32_t paths, uint64_t key,
+                         uint32_t bounces = 1) const {
     LightCounters counters;
     uint64_t rays = 0;
-    return TraceIndirect(*accel, *lights, r, paths, key, counters, rays);
+    return TraceIndirect(*accel, *lights, r, paths, bounces, key, counters, rays);
   }
 
   std::shared_ptr<const RayAccel> accel;
@@ -234,14 +235,62 @@ TEST(TraceIndirect, AFurnaceGivesPiRhoL) {
   EXPECT_LT(e.standard_error(), 0.01 * expected);
 }
 
+TEST(TraceIndirect, FurtherBouncesGiveTheGeometricSeries) {
+  const World world(MakeFurnace(0.6f, 1.5f));
+  for (const uint32_t bounces : {2u, 4u, 8u}) {
+    double expected = 0;
+    for (uint32_t k = 1; k <= bounces; ++k) expected += kPi * 1.5 * std::pow(0.6, k);
+    Estimate e;
+    for (uint64_t key = 0; key < 100; ++key) {
+      const Receiver r = world.At({0.3, -1, 0.2}, {0, 1, 0});
+      e.Add(static_cast<double>(world.Trace(r, 128, HashKey(13, key), bounces).irradiance.x));
+    }
+    EXPECT_NEAR(e.mean(), expected, 4 * e.standard_error());
+    EXPECT_LT(e.standard_error(), 0.01 * expected);
+  }
+}
+
+// The second bounce by hand: a path's first vertex receives what one bounce brings there.
+TEST(TraceIndirect, TheSecondBounceIsTheFirstOfItsVertices) {
+  const World world(MakeCornellBox());
+  const PreparedScene& scene = world.scene();
+  const Receiver r = CornellReceivers(world)[0];
+  TestRandom random(77);
+  Estimate by_hand[3], traced[3];
+  for (int i = 0; i < 4000; ++i) {
+    const Vec3f w(random.CosineDirection(Vec3d(r.normal)));
+    const auto hit = world.accel->Intersect(r.Leave(), w);
+    Rgb brings;
+    if (hit) {
+      Receiver at;
+      at.position = scene.PointOn(hit->triangle, hit->b1, hit->b2);
+      const Vec3f n = scene.GeometricNormal(hit->triangle);
+      at.normal = at.geometric_normal = hit->front ? n : -n;
+      at.offset_m = world.accel->SurfaceOffsetM(hit->triangle, at.position, n);
+      brings = scene.Surface(hit->triangle, hit->b1, hit->b2).albedo *
+               world.Trace(at, 8, static_cast<uint64_t>(i)).irradiance;
+    }
+    for (int c = 0; c < 3; ++c) by_hand[c].Add(static_cast<double>(brings[c]));
+  }
+  for (uint64_t key = 0; key < 400; ++key) {
+    const Rgb two = world.Trace(r, 64, key, 2).irradiance, one = world.Trace(r, 64, key).irradiance;
+    for (int c = 0; c < 3; ++c) traced[c].Add(static_cast<double>(two[c] - one[c]));
+  }
+  for (int c = 0; c < 3; ++c) {
+    const double error = std::hypot(by_hand[c].standard_error(), traced[c].standard_error());
+    EXPECT_NEAR(traced[c].mean(), by_hand[c].mean(), 4 * error);
+    EXPECT_LT(error, 0.1 * by_hand[c].mean());
+  }
+}
+
 TEST(TraceIndirect, BlackSurroundingsReflectNothingAndCostNoShadowRay) {
   Scene scene = MakeCornellBox();
   for (Material& m : scene.materials) m.base_color = {};
   const World world(scene);
   LightCounters counters;
   uint64_t rays = 0;
-  const TracedIrradiance t =
-      TraceIndirect(*world.accel, *world.lights, CornellReceivers(world)[0], 64, 1, counters, rays);
+  const TracedIrradiance t = TraceIndirect(*world.accel, *world.lights, CornellReceivers(world)[0],
+                                           64, 1, 1, counters, rays);
   EXPECT_EQ(t.irradiance, Rgb());
   EXPECT_EQ(t.standard_error, Rgb());
   EXPECT_EQ(rays, 64u);
@@ -262,7 +311,7 @@ TEST(TraceIndirect, PathsThatLeaveTheSceneCarryNothing) {
   LightCounters counters;
   uint64_t rays = 0;
   const TracedIrradiance t = TraceIndirect(
-      *world.accel, *world.lights, world.At({0.1, 0, 0.2}, {0, 1, 0}), 100, 1, counters, rays);
+      *world.accel, *world.lights, world.At({0.1, 0, 0.2}, {0, 1, 0}), 100, 1, 1, counters, rays);
   EXPECT_EQ(t.irradiance, Rgb());
   EXPECT_EQ(t.standard_error, Rgb());
   EXPECT_EQ(rays, 100u);
@@ -276,7 +325,7 @@ TEST(TraceIndirect, DirectionsBelowTheSurfaceAreNotTraced) {
   r.normal = {static_cast<float>(std::sin(kPi / 3)), 0.5f, 0};
   LightCounters counters;
   uint64_t rays = 0;
-  TraceIndirect(*world.accel, *world.lights, r, 4096, 2, counters, rays);
+  TraceIndirect(*world.accel, *world.lights, r, 4096, 1, 2, counters, rays);
   EXPECT_NEAR(static_cast<double>(rays), 0.75 * 4096, 0.01 * 4096);
 }
 
