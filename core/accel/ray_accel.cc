@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "core/base/fp_trap.h"
+#include "core/base/pulse.h"
 
 namespace farpoint {
 
@@ -88,6 +89,13 @@ struct RayAccel::Impl {
     for (unsigned id = 0; id < 2; ++id) {
       if (geometries[id]) rtcAttachGeometryByID(made, geometries[id], id);
     }
+    rtcSetSceneProgressMonitorFunction(
+        made,
+        [](void*, double) {
+          Pulse();
+          return true;
+        },
+        nullptr);
     rtcCommitScene(made);
     return made;
   }

@@ -8,6 +8,7 @@
 #include <cstdlib>
 #include <limits>
 
+#include "core/base/pulse.h"
 #include "core/math/elementary.h"
 #include "core/math/sampling.h"
 
@@ -31,6 +32,26 @@ uint64_t KeyOf(int64_t x, int64_t y, int64_t z) {
   return static_cast<uint64_t>(x) << 42 | static_cast<uint64_t>(y) << 21 | static_cast<uint64_t>(z);
 }
 
+// A worker builds grids while it renders, and who gives no sign of life for seconds loses its tile.
+constexpr size_t kPulsePiece = size_t{1} << 17;
+
+template <typename T>
+void SortInPieces(std::vector<T>& values) {
+  const auto at = [&](size_t i) {
+    return values.begin() + static_cast<std::ptrdiff_t>(std::min(i, values.size()));
+  };
+  for (size_t i = 0; i < values.size(); i += kPulsePiece) {
+    std::sort(at(i), at(i + kPulsePiece));
+    Pulse();
+  }
+  for (size_t width = kPulsePiece; width < values.size(); width *= 2) {
+    for (size_t i = 0; i + width < values.size(); i += 2 * width) {
+      std::inplace_merge(at(i), at(i + width), at(i + 2 * width));
+      Pulse();
+    }
+  }
+}
+
 }  // namespace
 
 SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), value_(value) {
@@ -42,6 +63,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), 
     const Surfel s = tree.surfel(static_cast<uint32_t>(i));
     area += kPi * static_cast<double>(s.radius_m) * static_cast<double>(s.radius_m);
     box.Extend(s.position);
+    if (i % kPulsePiece == 0) Pulse();
   }
   spacing_m_ = static_cast<float>(std::sqrt(area / static_cast<double>(n)));
   // At most 2^20 cells along an axis, so that keys fit.
@@ -60,7 +82,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), 
         KeyOf(static_cast<int64_t>(q.x), static_cast<int64_t>(q.y), static_cast<int64_t>(q.z)),
         static_cast<uint32_t>(i)};
   }
-  std::sort(order.begin(), order.end());
+  SortInPieces(order);
   uint64_t different = 0;
   for (uint64_t i = 0; i < n; ++i) different += i == 0 || order[i].key != order[i - 1].key;
   size_t size = 16;
@@ -84,6 +106,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), 
     while (cells_[at].key != kEmpty) at = (at + 1) & (size - 1);
     cells_[at] = {order[i].key, static_cast<uint32_t>(i), static_cast<uint32_t>(end - i)};
     i = end;
+    Pulse();
   }
 }
 

@@ -500,7 +500,9 @@ void ExpectLeaves(const Scene& description, uint64_t seed, bool crowded = true) 
   }
   EXPECT_EQ(own, 0);
   EXPECT_EQ(coplanar, 0);
-  if (crowded) EXPECT_GT(hits, kRays / 10);
+  if (crowded) {
+    EXPECT_GT(hits, kRays / 10);
+  }
 }
 
 TEST(RayAccel, LeavingRaysMissTheirSurface) {
