@@ -45,7 +45,9 @@ TEST(Eta, IsCloseForTilesThatCostAlike) {
   Play(
       100, 1, [](uint32_t j) { return 0.5 * j; },
       [](uint32_t j, double left, double truth) {
-        if (j >= 20) EXPECT_NEAR(left, truth, 0.15 * truth + 0.01) << j;
+        if (j >= 20) {
+          EXPECT_NEAR(left, truth, 0.15 * truth + 0.01) << j;
+        }
       });
 }
 
@@ -69,7 +71,9 @@ TEST(Eta, LearnsAFramesShapeFromTheOneBefore) {
     return before + (frame == 0 ? 2 : 1) * within(tile) * (tile == 0 ? 0 : 1);
   };
   Play(80, 8, time, [&](uint32_t j, double left, double truth) {
-    if (j >= 20) EXPECT_NEAR(left, truth, 0.02 * truth + 1e-6) << j;
+    if (j >= 20) {
+      EXPECT_NEAR(left, truth, 0.02 * truth + 1e-6) << j;
+    }
   });
 }
 
