@@ -54,7 +54,7 @@ void SortInPieces(std::vector<T>& values) {
 
 }  // namespace
 
-SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), value_(value) {
+SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
   if (tree.empty()) return;
   const uint64_t n = tree.surfel_count();
   double area = 0;
@@ -94,10 +94,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree, SurfelValue value) : tree_(tree), 
     while (end < n && order[end].key == order[i].key) {
       const uint32_t slot = order[end].slot;
       const Surfel s = tree.surfel(slot);
-      const RadianceSides l =
-          value == SurfelValue::kRadiance
-              ? tree.radiance_of(slot)
-              : RadianceSides{tree.indirect_of(slot, true), tree.indirect_of(slot, false)};
+      const RadianceSides l = tree.radiance_of(slot);
       entries_[end] = {s.position, slot, s.normal, l.front.x + l.front.y + l.front.z,
                        l.back.x + l.back.y + l.back.z};
       ++end;
@@ -161,19 +158,27 @@ void SurfelGrid::ForEachNear(const Vec3f& p, const Vec3f& n, const See& see) con
 
 // Surfels that are wound as the surface is come first: on the far side of a thin board, and where
 // two objects touch, there are others as near, whose backs are inside.
+struct SurfelGrid::Nearest {
+  static constexpr float kNone = std::numeric_limits<float>::infinity();
+  // Of each winding; squared.
+  float distance2[2] = {kNone, kNone};
+  const Entry* entry[2] = {nullptr, nullptr};
+
+  void See(const Entry& other, float d2, int turned) {
+    if (!(d2 < distance2[turned])) return;
+    distance2[turned] = d2;
+    entry[turned] = &other;
+  }
+  int turned() const { return entry[0] != nullptr ? 0 : 1; }
+  // Null: none was seen.
+  const Entry* found() const { return entry[turned()]; }
+};
+
 std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
                                     Vec3f* where) const {
-  if (value_ == SurfelValue::kIndirect) {
-    const std::optional<Side> side = FindVisible(p, n, front, where);
-    if (!side) return std::nullopt;
-    return tree_.indirect_of(side->slot, side->front);
-  }
-  const float farthest = std::numeric_limits<float>::infinity();
-  float best[2] = {farthest, farthest};
-  uint32_t found[2] = {~0u, ~0u};
-  Vec3f place[2];
+  Nearest nearest;
   // Of those within a spacing, of each winding.
-  float darkest[2] = {farthest, farthest};
+  float darkest[2] = {Nearest::kNone, Nearest::kNone};
   float brightest[2] = {0, 0};
   ForEachNear(p, n, [&](const Entry& entry, float d2, int turned) {
     const float sum = front == (turned == 0) ? entry.front : entry.back;
@@ -181,36 +186,28 @@ std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
       darkest[turned] = std::min(darkest[turned], sum);
       brightest[turned] = std::max(brightest[turned], sum);
     }
-    if (!(d2 < best[turned])) return;
-    best[turned] = d2;
-    found[turned] = entry.slot;
-    place[turned] = entry.position;
+    nearest.See(entry, d2, turned);
   });
-  const int turned = found[0] != ~0u ? 0 : 1;
-  if (found[turned] == ~0u) return std::nullopt;
-  if (where != nullptr) *where = place[turned];
+  const Entry* const found = nearest.found();
+  if (found == nullptr) return std::nullopt;
+  const int turned = nearest.turned();
+  if (where != nullptr) *where = found->position;
   if (darkest[turned] < kLeastContrast * brightest[turned]) return std::nullopt;
-  return tree_.radiance_of(found[turned], front == (turned == 0));
+  return tree_.radiance_of(found->slot, front == (turned == 0));
 }
 
 std::optional<SurfelGrid::Side> SurfelGrid::FindVisible(const Vec3f& p, const Vec3f& n, bool front,
                                                         Vec3f* where) const {
-  const float farthest = std::numeric_limits<float>::infinity();
-  float best[2] = {farthest, farthest};
-  uint32_t found[2] = {~0u, ~0u};
-  Vec3f place[2];
+  Nearest nearest;
   ForEachNear(p, n, [&](const Entry& entry, float d2, int turned) {
-    if (!(d2 < best[turned])) return;
+    if (!(d2 < nearest.distance2[turned])) return;
     const unsigned side = front == (turned == 0) ? kFrontVisible : kBackVisible;
-    if ((tree_.visible_sides(entry.slot) & side) == 0) return;
-    best[turned] = d2;
-    found[turned] = entry.slot;
-    place[turned] = entry.position;
+    if ((tree_.visible_sides(entry.slot) & side) != 0) nearest.See(entry, d2, turned);
   });
-  const int turned = found[0] != ~0u ? 0 : 1;
-  if (found[turned] == ~0u) return std::nullopt;
-  if (where != nullptr) *where = place[turned];
-  return Side{found[turned], front == (turned == 0)};
+  const Entry* const found = nearest.found();
+  if (found == nullptr) return std::nullopt;
+  if (where != nullptr) *where = found->position;
+  return Side{found->slot, front == (nearest.turned() == 0)};
 }
 
 namespace {
@@ -259,13 +256,14 @@ void SurfelAtlas::FreeDeleter::operator()(void* p) const { std::free(p); }
 SurfelAtlas::SurfelAtlas(const RayAccel& accel, const PointTree& tree, const SurfelAtlas* radiance)
     : accel_(accel),
       scene_(accel.scene()),
+      tree_(tree),
       radiance_(radiance),
-      grid_(tree, radiance == nullptr ? SurfelValue::kRadiance : SurfelValue::kIndirect) {
+      grid_(radiance == nullptr ? std::make_shared<const SurfelGrid>(tree) : radiance->grid_) {
   const PreparedScene& scene = scene_;
   const size_t count = scene.triangles().size();
   patches_.resize(count);
-  if (!(grid_.spacing_m() > 0.0f)) return;
-  float texel = grid_.spacing_m();
+  if (!(grid_->spacing_m() > 0.0f)) return;
+  float texel = grid_->spacing_m();
   uint64_t total = 0;
   for (;; texel *= 1.5f) {
     total = 0;
@@ -302,15 +300,17 @@ uint64_t SurfelAtlas::Resolve(const Point& point, const Texel& texel, uint32_t s
   const Vec3f n = scene_.GeometricNormal(triangle), out = front ? n : -n;
   const Vec3f p = at(middle, middle);
   Vec3f surfel;
-  const std::optional<Rgb> found = grid_.Find(p, n, front, &surfel);
-  const Vec3f lift = out * (kLift * grid_.spacing_m());
+  const Vec3f lift = out * (kLift * grid_->spacing_m());
   if (radiance_ != nullptr) {
     // In a crack it is darker than a surfel outside of it knows.
     const Vec3f leaving = accel_.LeaveSurface(triangle, p, out);
+    const auto found = grid_->FindVisible(p, n, front, &surfel);
     const bool usable = found && !CutOff(p + lift, surfel + lift) &&
-                        !accel_.Occluded(leaving, out, kCrack * grid_.spacing_m());
-    return Encode(usable ? *found : Gathered(point, p, out, word));
+                        !accel_.Occluded(leaving, out, kCrack * grid_->spacing_m());
+    return Encode(usable ? tree_.indirect_of(found->slot, found->front)
+                         : Gathered(point, p, out, word));
   }
+  const std::optional<Rgb> found = grid_->Find(p, n, front, &surfel);
   if (!found) return kResolved | kNone;
   const Vec3f lifted = accel_.LeaveSurface(triangle, p, out);
   // What cuts through the half cuts two of its sides, so two of them tell. A little within them:

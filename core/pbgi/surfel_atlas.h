@@ -17,24 +17,17 @@
 
 namespace farpoint {
 
-// What is asked of surfels.
-enum class SurfelValue {
-  kRadiance,  // that they reflect, W/(m² sr)
-  kIndirect,  // the irradiance after further bounces, W/m²: smooth where direct light is not
-};
-
 // The surfel nearest to a point, by a hash grid over the tree's surfels. Immutable; thread-safe.
 class SurfelGrid {
  public:
-  // `tree` must outlive the grid; for kIndirect it must have it.
-  explicit SurfelGrid(const PointTree& tree, SurfelValue value = SurfelValue::kRadiance);
+  // `tree` must outlive the grid.
+  explicit SurfelGrid(const PointTree& tree);
 
   // The radiance [W/(m² sr)] on the front (`n`, unit) or back of a surface at `p`: that of the
   // nearest surfel within 1.5 spacings whose plane is within 60° of n's and passes within a tenth
   // of a spacing of p, of those that look along n if there are any, else of those that look
   // against it; none if there is none, and where those within one spacing differ more than
   // fourfold.
-  // kIndirect: the irradiance of the surfel of FindVisible.
   // `where`: none, or gets the surfel's position.
   std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front, Vec3f* where = nullptr) const;
 
@@ -56,12 +49,13 @@ class SurfelGrid {
     Vec3f position;
     uint32_t slot;
     Vec3f normal;
-    float front, back;  // the sum of the value's channels
+    float front, back;  // the sum of the radiance's channels
   };
   struct Cell {
     uint64_t key = kEmpty;
     uint32_t first = 0, count = 0;
   };
+  struct Nearest;
   static constexpr uint64_t kEmpty = ~uint64_t{0};
   const Cell* FindCell(uint64_t key) const;
   // Calls `see` with each entry of the cells about p that Find's rules admit: the squared distance,
@@ -70,7 +64,6 @@ class SurfelGrid {
   void ForEachNear(const Vec3f& p, const Vec3f& n, const See& see) const;
 
   const PointTree& tree_;
-  SurfelValue value_;
   float spacing_m_ = 0, inverse_cell_ = 0;
   Vec3f low_;
   std::vector<Entry> entries_;  // cell by cell
@@ -84,7 +77,8 @@ class SurfelAtlas {
   // The tree must be of the accelerated scene; both must outlive the atlas. 16 bytes a texel, of
   // memory that is touched when it is read; at most kMaxTexels (then texels are larger than
   // surfels).
-  // `radiance`: null, or an atlas of kRadiance that outlives this one of kIndirect.
+  // With `radiance`, an atlas of the same scene and tree that outlives this one and lends its grid:
+  // of the irradiance after further bounces, W/m², in place of the radiance. The tree must have it.
   SurfelAtlas(const RayAccel& accel, const PointTree& tree, const SurfelAtlas* radiance = nullptr);
 
   // The point (b1, b2) of `triangle`, on the side of its front (winding) or back.
@@ -95,8 +89,9 @@ class SurfelAtlas {
   };
   // The radiance at a point, as SurfelGrid::Find gives it at the texel's centre, rounded to 16 bits
   // below the largest channel. None, too, where something stands on the texel, or between it and
-  // the surfel: the light on its other side is another. Of kIndirect the irradiance; where no
-  // surfel has it for the texel, that which kTexelRays rays from its centre bring.
+  // the surfel: the light on its other side is another. Of irradiance that of the surfel of
+  // FindVisible; where no surfel has it for the texel, that which kTexelRays rays from its centre
+  // bring.
   std::optional<Rgb> Radiance(const Point& point) const;
   // The same of up to kTogether points, whose fetches from memory overlap: bit i is set where there
   // is one at points[i].
@@ -104,7 +99,7 @@ class SurfelAtlas {
 
   static constexpr size_t kTogether = 64;
 
-  float spacing_m() const { return grid_.spacing_m(); }
+  float spacing_m() const { return grid_->spacing_m(); }
 
   static constexpr uint32_t kTexelRays = 32;
   static constexpr uint64_t kMaxTexels = uint64_t{1} << 28;
@@ -130,8 +125,9 @@ class SurfelAtlas {
 
   const RayAccel& accel_;
   const PreparedScene& scene_;
+  const PointTree& tree_;
   const SurfelAtlas* const radiance_;
-  SurfelGrid grid_;
+  const std::shared_ptr<const SurfelGrid> grid_;
   std::vector<Patch> patches_;  // by triangle
   // Two words a texel, front and back: 0: not resolved yet; see the .cc.
   std::unique_ptr<uint64_t[], FreeDeleter> words_;

@@ -77,11 +77,7 @@ TracedIrradiance TraceIndirect(const RayAccel& accel, const LightSampler& lights
       counters.skipped_black += met - hits.count;
       std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
       std::array<V8, kRaysTogether / kHitLanes> irradiance;
-      const size_t groups = (hits.count + kHitLanes - 1) / kHitLanes;
-      for (uint32_t g = 0; g < groups; ++g) {
-        points[g] = SurfaceAt(hits, g * kHitLanes);
-        points[g].active = (1u << std::min(kHitLanes, hits.count - g * kHitLanes)) - 1u;
-      }
+      const size_t groups = SurfacesOf(hits, points);
       lights.IrradianceEach(std::span(points).first(groups),
                             bounce == 1 ? light_key : HashKey(light_key, bounce), 2,
                             std::span(irradiance).first(groups), counters, needless);

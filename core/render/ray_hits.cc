@@ -1,5 +1,6 @@
 #include "core/render/ray_hits.h"
 
+#include <algorithm>
 #include <array>
 #include <cstring>
 
@@ -94,6 +95,16 @@ SurfacePoints8 SurfaceAt(const RayHits& hits, size_t first) {
   points.offset_m = SurfaceOffset(a, b, c, points.ng, points.p);
   std::memcpy(&points.index, &hits.index[first], sizeof(points.index));
   return points;
+}
+
+size_t SurfacesOf(const RayHits& hits,
+                  std::array<SurfacePoints8, kRaysTogether / kHitLanes>& points) {
+  const size_t groups = (hits.count + kHitLanes - 1) / kHitLanes;
+  for (uint32_t g = 0; g < groups; ++g) {
+    points[g] = SurfaceAt(hits, g * kHitLanes);
+    points[g].active = (1u << std::min(kHitLanes, hits.count - g * kHitLanes)) - 1u;
+  }
+  return groups;
 }
 
 }  // namespace farpoint

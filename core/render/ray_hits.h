@@ -48,4 +48,8 @@ void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black
 // rays came from, to the bits of PreparedScene's functions. `active` is left to the caller.
 SurfacePoints8 SurfaceAt(const RayHits& hits, size_t first);
 
+// SurfaceAt of all hits, their lanes active; returns how many groups of kHitLanes that are.
+size_t SurfacesOf(const RayHits& hits,
+                  std::array<SurfacePoints8, kRaysTogether / kHitLanes>& points);
+
 }  // namespace farpoint

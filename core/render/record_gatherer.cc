@@ -133,11 +133,7 @@ class HitReader {
     shaded += near.count;
     std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
     std::array<V8, kRaysTogether / kHitLanes> irradiance;
-    const size_t groups = (near.count + kHitLanes - 1) / kHitLanes;
-    for (uint32_t g = 0; g < groups; ++g) {
-      points[g] = SurfaceAt(near, g * kHitLanes);
-      points[g].active = (1u << std::min(kHitLanes, near.count - g * kHitLanes)) - 1u;
-    }
+    const size_t groups = SurfacesOf(near, points);
     scene_.lights->IrradianceEach(std::span(points).first(groups), light_key_, 2,
                                   std::span(irradiance).first(groups), counters);
     std::array<Rgb, kRaysTogether> indirect;
