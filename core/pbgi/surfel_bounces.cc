@@ -17,8 +17,8 @@ namespace {
 
 constexpr uint32_t kLinks = 8;
 constexpr uint32_t kNoLink = ~uint32_t{0};
-// Slots to either side that a surfel looks at for neighbours, and how alike those are.
-constexpr size_t kWindow = 24;
+// Sides before and after its own that a surfel looks at for neighbours, and how alike those are.
+constexpr size_t kWindow = 48;
 constexpr float kReach = 2.5f;       // spacings
 constexpr float kSamePlane = 0.25f;  // spacings off the plane
 constexpr float kSameNormal = 0.9f;  // cosine
@@ -214,8 +214,8 @@ class Bouncer {
     const float spacing2 = cloud_.area_m2[s];
     Rgb sum;
     uint32_t count = 0;
-    const size_t begin = i < 2 * kWindow ? 0 : i - 2 * kWindow;
-    const size_t end = std::min(sides_.size(), i + 2 * kWindow + 1);
+    const size_t begin = i < kWindow ? 0 : i - kWindow;
+    const size_t end = std::min(sides_.size(), i + kWindow + 1);
     for (size_t j = begin; j < end; ++j) {
       const uint32_t other = SurfelOf(j);
       const Vec3f d = cloud_.position[other] - p;

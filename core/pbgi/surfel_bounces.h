@@ -1,14 +1,14 @@
 // Further bounces of indirect light: surfels gather from surfels before the final gather reads
 // them.
 //
-// The links between surfels are traced once: kLinks cosine-distributed rays from each visible side
+// The links between surfels are traced once: K = 8 cosine-distributed rays from each visible side
 // of each surfel, each to the surfel nearest to what it hits. Then a bounce is one product of that
-// sparse matrix with the radiance of the bounce before,
-//   L_1 = ρ/π E_direct,   E_b = π / kLinks Σ L_b(link),   L_(b+1) = L_1 + ρ/π E_b,
+// sparse matrix with the radiance [W/(m² sr)] of the bounce before,
+//   L_1 = ρ/π E_direct,   E_b = π / K Σ L_b(link) [W/m²],   L_(b+1) = L_1 + ρ/π E_b,
 // without a ray. Surfels share their gathers like receivers do (paper, section 3): E_b is the mean
-// over the surfel's neighbours on the same plane, those within 2.5 spacings of the nearest kWindow
-// in the order of the tree, about a hundred rays in all. What is left of their noise the final
-// gather averages over the surfels that it sees.
+// over the surfel's neighbours on the same plane, those within 2.5 spacings of the 48 sides before
+// it and after it in the order of the tree, about a hundred rays in all. What is left of their
+// noise the final gather averages over the surfels that it sees.
 #pragma once
 
 #include "core/accel/ray_accel.h"
