@@ -170,4 +170,23 @@ Picture Enlarged(const Picture& picture, const PixelRect& part, int times) {
   return out;
 }
 
+Picture SideBySide(const std::vector<Picture>& parts) {
+  constexpr int kGap = 6;
+  Picture row;
+  for (const Picture& part : parts) {
+    row.width += part.width + (row.width > 0 ? kGap : 0);
+    row.height = std::max(row.height, part.height);
+  }
+  row.rgb.assign(size_t{3} * static_cast<size_t>(row.width) * static_cast<size_t>(row.height), 255);
+  int x0 = 0;
+  for (const Picture& part : parts) {
+    for (int y = 0; y < part.height; ++y) {
+      std::copy_n(part.rgb.begin() + ptrdiff_t{3} * y * part.width, 3 * part.width,
+                  row.rgb.begin() + 3 * (ptrdiff_t{y} * row.width + x0));
+    }
+    x0 += part.width + kGap;
+  }
+  return row;
+}
+
 }  // namespace farpoint

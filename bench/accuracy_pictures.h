@@ -42,5 +42,7 @@ Picture DenseErrorPicture(const PixelRect& rect, std::span<const float> errors, 
 Picture ShrunkTo(Picture picture, int width);
 // The part of it that lies in the rectangle, each pixel `times` as wide and high.
 Picture Enlarged(const Picture& picture, const PixelRect& part, int times);
+// From left to right, six white pixels between them.
+Picture SideBySide(const std::vector<Picture>& parts);
 
 }  // namespace farpoint

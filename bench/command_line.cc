@@ -347,22 +347,66 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
       ->capture_default_str()
       ->check(CLI::Range(0, 1024));
 
+  AntialiasingOptions& aa = line.antialiasing;
+  if (const char* scenes = std::getenv("FARPOINT_SCENES")) aa.folders.scenes = scenes;
+  std::string aa_quality = "normal";
+  CLI::App* antialiasing = app.add_subcommand(
+      "antialiasing",
+      "What more samples per pixel cost, their error, and pictures of edges; writes "
+      "antialiasing.json and NAME-edges.png");
+  AddCommonOptions(*antialiasing, line.output_dir, aa.quick);
+  antialiasing->add_option("--case", aa.cases,
+                           "A frame of the accuracy report, may be repeated [cornell, sponza-sun, "
+                           "coffee, city]");
+  antialiasing->add_option(
+      "--scenes", aa.folders.scenes,
+      "Folder of scenes of others [FARPOINT_SCENES; without one the own scenes only]");
+  antialiasing
+      ->add_option("--spp", aa.spp, "Samples per pixel, several [1,4,16,64, quick: 1,4]; 1 always")
+      ->delimiter(',')
+      ->check(CLI::Range(1, 256));
+  antialiasing->add_option("--scale", aa.scale, "Of the frames' width and height")
+      ->capture_default_str()
+      ->check(CLI::Range(0.01, 4.0));
+  antialiasing->add_option("--quality", aa_quality, "draft, normal or fine")->capture_default_str();
+  antialiasing->add_option("--points", aa.points, "Surfels [by the scene, quick: 20000]")
+      ->check(CLI::Range(uint64_t{1}, uint64_t{1} << 31));
+  antialiasing
+      ->add_option("--light-samples", aa.light_samples, "Shadow rays, as of farpoint render")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 4096));
+  antialiasing->add_option("--seed", aa.seed, "Of every random choice")->capture_default_str();
+  antialiasing->add_option("--reference-pixels", aa.reference_pixels, "Pixels of the truth, about")
+      ->capture_default_str()
+      ->check(CLI::Range(size_t{16}, size_t{1} << 20));
+  antialiasing->add_option("--paths", aa.paths, "Of the truth, per pixel")
+      ->capture_default_str()
+      ->check(CLI::Range(16u, 1u << 20));
+  antialiasing->add_option("--repeat", aa.repeat, "Rounds")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 1000));
+  antialiasing->add_flag("!--no-pictures", aa.pictures, "Tables only");
+  antialiasing->add_option("--threads", aa.threads, "0: all cores")
+      ->capture_default_str()
+      ->check(CLI::Range(0, 1024));
+
   // CLI11 takes the arguments from the back.
   std::reverse(args.begin(), args.end());
   try {
     app.parse(args);
   } catch (const CLI::CallForHelp&) {
-    const CLI::App* asked = pareto->parsed()      ? pareto
-                            : micro->parsed()     ? micro
-                            : rebake->parsed()    ? rebake
-                            : lights->parsed()    ? lights
-                            : paper->parsed()     ? paper
-                            : stability->parsed() ? stability
-                            : scale->parsed()     ? scale
-                            : skip->parsed()      ? skip
-                            : service->parsed()   ? service
-                            : figures->parsed()   ? figures
-                                                  : &app;
+    const CLI::App* asked = pareto->parsed()         ? pareto
+                            : micro->parsed()        ? micro
+                            : rebake->parsed()       ? rebake
+                            : lights->parsed()       ? lights
+                            : paper->parsed()        ? paper
+                            : stability->parsed()    ? stability
+                            : scale->parsed()        ? scale
+                            : skip->parsed()         ? skip
+                            : service->parsed()      ? service
+                            : figures->parsed()      ? figures
+                            : antialiasing->parsed() ? antialiasing
+                                                     : &app;
     line.print = asked->help(asked == &app ? "" : "farpoint-bench");
     return line;
   } catch (const CLI::CallForVersion& version) {
@@ -371,20 +415,24 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   } catch (const CLI::ParseError& error) {
     return absl::InvalidArgumentError(std::string(error.what()) + "; see farpoint-bench --help");
   }
-  line.verb = pareto->parsed()      ? BenchVerb::kPareto
-              : rebake->parsed()    ? BenchVerb::kRebake
-              : lights->parsed()    ? BenchVerb::kLights
-              : accuracy->parsed()  ? BenchVerb::kAccuracy
-              : paper->parsed()     ? BenchVerb::kPaper
-              : stability->parsed() ? BenchVerb::kStability
-              : scale->parsed()     ? BenchVerb::kScale
-              : skip->parsed()      ? BenchVerb::kSkip
-              : service->parsed()   ? BenchVerb::kService
-              : figures->parsed()   ? BenchVerb::kFigures
-                                    : BenchVerb::kMicro;
+  line.verb = pareto->parsed()         ? BenchVerb::kPareto
+              : rebake->parsed()       ? BenchVerb::kRebake
+              : lights->parsed()       ? BenchVerb::kLights
+              : accuracy->parsed()     ? BenchVerb::kAccuracy
+              : paper->parsed()        ? BenchVerb::kPaper
+              : stability->parsed()    ? BenchVerb::kStability
+              : scale->parsed()        ? BenchVerb::kScale
+              : skip->parsed()         ? BenchVerb::kSkip
+              : service->parsed()      ? BenchVerb::kService
+              : figures->parsed()      ? BenchVerb::kFigures
+              : antialiasing->parsed() ? BenchVerb::kAntialiasing
+                                       : BenchVerb::kMicro;
   const absl::StatusOr<Quality> asked_quality = QualityFromName(quality);
   if (!asked_quality.ok()) return Annotate(asked_quality.status(), "--quality");
   a.quality = *asked_quality;
+  const absl::StatusOr<Quality> aa_asked = QualityFromName(aa_quality);
+  if (!aa_asked.ok()) return Annotate(aa_asked.status(), "--quality");
+  aa.quality = *aa_asked;
   const absl::StatusOr<Quality> scale_asked = QualityFromName(scale_quality);
   if (!scale_asked.ok()) return Annotate(scale_asked.status(), "--quality");
   g.quality = *scale_asked;

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "bench/accuracy.h"
+#include "bench/antialiasing.h"
 #include "bench/figures.h"
 #include "bench/lights.h"
 #include "bench/micro.h"
@@ -31,7 +32,8 @@ enum class BenchVerb {
   kScale,
   kSkip,
   kService,
-  kFigures
+  kFigures,
+  kAntialiasing
 };
 
 struct BenchCommandLine {
@@ -48,6 +50,7 @@ struct BenchCommandLine {
   SkipOptions skip;
   ServiceOptions service;
   FiguresOptions figures;
+  AntialiasingOptions antialiasing;
   MicroOptions micro;  // json_path is left empty: it lies in output_dir
 };
 

@@ -42,22 +42,6 @@ void Paste(Picture& into, const Picture& from, int x0, int y0) {
   }
 }
 
-// Side by side, from left to right.
-Picture Row(const std::vector<Picture>& parts) {
-  int width = -kGap, height = 0;
-  for (const Picture& part : parts) {
-    width += part.width + kGap;
-    height = std::max(height, part.height);
-  }
-  Picture row = Blank(width, height, 255);
-  int x = 0;
-  for (const Picture& part : parts) {
-    Paste(row, part, x, 0);
-    x += part.width + kGap;
-  }
-  return row;
-}
-
 Picture Column(const Picture& top, const Picture& bottom) {
   Picture column = Blank(std::max(top.width, bottom.width), top.height + kGap + bottom.height, 255);
   Paste(column, top, 0, 0);
@@ -279,7 +263,7 @@ class Method {
     for (const Picture& part : parts) {
       enlarged.push_back(Enlarged(part, {0, 0, side, side}, 256 / side));
     }
-    return Row(enlarged);
+    return SideBySide(enlarged);
   }
 
   // What the pixel's ray meets.
@@ -385,8 +369,8 @@ absl::Status DrawMethod(const FiguresOptions& options, Writer& writer, const Log
   const Seen& floor = method.At(side / 4, side - side / 6);
   const Seen& block = method.At(side / 2, side - side / 10);
   if (!floor.hit || !block.hit) return absl::InternalError("figures: the floor is not seen");
-  FP_RETURN_IF_ERROR(
-      writer.Write("cut.png", Row({method.Cut(floor.receiver), method.Cut(block.receiver)})));
+  FP_RETURN_IF_ERROR(writer.Write(
+      "cut.png", SideBySide({method.Cut(floor.receiver), method.Cut(block.receiver)})));
   FP_ASSIGN_OR_RETURN(const auto many, MicroWorkload::Make(options.quick));
   FP_ASSIGN_OR_RETURN(const Picture buffers, Method(*many, options.side_px).Microbuffers());
   return writer.Write("microbuffers.png", buffers);
@@ -508,7 +492,7 @@ absl::Status DrawParameters(const FiguresOptions& options, Writer& writer, Figur
   const auto flush = [&]() -> absl::Status {
     if (parts.empty()) return absl::OkStatus();
     parts.push_back(Detail(ColourPicture(truth.film, Layer::kIrradiance, white)));
-    const Picture row = Row(parts);
+    const Picture row = SideBySide(parts);
     parts.clear();
     return writer.Write("parameter-" + parameter.substr(2) + ".png", row);
   };
@@ -556,9 +540,9 @@ absl::Status DrawParameters(const FiguresOptions& options, Writer& writer, Figur
                            Detail(DenseErrorPicture(rect, errors, kFullError))));
     if (parameter == "--quality" && variant.value == "normal") {
       FP_RETURN_IF_ERROR(writer.Write(
-          "layers.png", Row({ColourPicture(rendered.film, Layer::kDirect, beauty_white),
-                             ColourPicture(rendered.film, Layer::kIndirect, beauty_white),
-                             ColourPicture(rendered.film, Layer::kBeauty, beauty_white)})));
+          "layers.png", SideBySide({ColourPicture(rendered.film, Layer::kDirect, beauty_white),
+                                    ColourPicture(rendered.film, Layer::kIndirect, beauty_white),
+                                    ColourPicture(rendered.film, Layer::kBeauty, beauty_white)})));
     }
   }
   return flush();

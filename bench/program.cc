@@ -238,6 +238,28 @@ absl::Status Figures(const BenchCommandLine& line, std::ostream& out, std::ostre
   return absl::OkStatus();
 }
 
+absl::Status Antialiasing(const BenchCommandLine& line, std::ostream& out, std::ostream& err) {
+  const std::filesystem::path dir = line.output_dir;
+  // A folder that cannot be written should not cost the time of a run.
+  const std::filesystem::path probe = dir / "antialiasing.json.part";
+  FP_RETURN_IF_ERROR(WriteText(probe, ""));
+  std::error_code error;
+  std::filesystem::remove(probe, error);
+  FP_ASSIGN_OR_RETURN(const AntialiasingReport report,
+                      RunAntialiasing(line.antialiasing, dir.string(), [&](std::string_view text) {
+                        err << "farpoint-bench: " << text << std::endl;
+                      }));
+  FP_RETURN_IF_ERROR(WriteText(dir / "antialiasing.json", AntialiasingJson(report)));
+  out << AntialiasingTable(report) << "\n" << (dir / "antialiasing.json").string() << "\n";
+  for (const std::string& file : report.files) out << (dir / file).string() << "\n";
+  if (report.scenes.empty()) {
+    return absl::InvalidArgumentError(
+        "antialiasing: nothing was measured: the cases that were asked for need --scenes DIR with "
+        "their files (the report lists what was left out)");
+  }
+  return absl::OkStatus();
+}
+
 absl::Status Micro(const BenchCommandLine& line, std::ostream& out) {
   MicroOptions options = line.micro;
   options.json_path = (std::filesystem::path(line.output_dir) / "micro.json").string();
@@ -274,6 +296,8 @@ absl::Status Run(const BenchCommandLine& line, std::ostream& out, std::ostream& 
       return Service(line, out, err);
     case BenchVerb::kFigures:
       return Figures(line, out, err);
+    case BenchVerb::kAntialiasing:
+      return Antialiasing(line, out, err);
     case BenchVerb::kMicro:
       return Micro(line, out);
   }

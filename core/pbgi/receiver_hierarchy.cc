@@ -195,6 +195,9 @@ ReceiverHierarchy::ReceiverHierarchy(const HierarchyParams& params, const PixelR
   for (int i = 0; i < kPixelLevels; ++i) {
     levels_.push_back(std::make_unique<Level>(1, false, samples(1)));
   }
+  for (uint32_t strata = samples(1); strata >= std::max(1u, params.least_samples); strata /= 2) {
+    own_grids_.emplace_back(strata);
+  }
 }
 
 // One call of Prepare.
@@ -662,12 +665,17 @@ bool ReceiverHierarchy::Pass::Pixels(size_t l, const PixelRect& region) {
 }
 
 ScreenRecord ReceiverHierarchy::MakeOwnRecord(const ServedReceiver& receiver, float footprint_m,
-                                              uint64_t key) const {
+                                              uint64_t key, float share) const {
+  size_t halved = 0;
+  while (halved + 1 < own_grids_.size() && 4 * share <= 1) {
+    share *= 4;
+    ++halved;
+  }
   ScreenRecord record;
   record.x_px = receiver.x_px;
   record.y_px = receiver.y_px;
   record.screen_reach_px = ReachOf(1);
-  record.gather = source_.Gather(*receiver.receiver, levels_.back()->grid,
+  record.gather = source_.Gather(*receiver.receiver, own_grids_[halved],
                                  HashKey(params_.seed, kKeyGather, key, 0));
   SetReach(footprint_m, std::numeric_limits<float>::infinity(), record);
   return record;

@@ -162,10 +162,15 @@ class ReceiverHierarchy {
                                       Counts& counts) const;
 
   // A record for a receiver that the view serves badly (it lies beside the pixel's centre, on
-  // another surface), with the finest level's strata and reach. `key` tells it from others.
-  ScreenRecord MakeOwnRecord(const ServedReceiver& receiver, float footprint_m, uint64_t key) const;
+  // another surface), with the finest level's reach. `share`: the part of its pixel that the record
+  // may serve, (0, 1]; it has the finest level's strata times the root of that, rounded up to a
+  // power of two, but not fewer than params.least_samples. `key` tells it from others.
+  ScreenRecord MakeOwnRecord(const ServedReceiver& receiver, float footprint_m, uint64_t key,
+                             float share = 1) const;
 
   const HierarchyParams& params() const { return params_; }
+  // Strata of the finest level's records.
+  uint32_t finest_strata() const { return own_grids_.front().size(); }
 
   static constexpr size_t kKeptRecords = size_t{1} << 21;
 
@@ -191,6 +196,7 @@ class ReceiverHierarchy {
   const PixelRect frame_;
   const PlaceSource& source_;
   std::vector<std::unique_ptr<Level>> levels_;
+  std::vector<HemisphereGrid> own_grids_;  // of records for single receivers, each half the last
 };
 
 }  // namespace farpoint

@@ -40,7 +40,7 @@ constexpr float kMostSpread = 0.15f, kMostDraftSpread = 0.4f;
 constexpr float kMostOpenSpread = 0.05f;
 
 // Keys of independent random choices.
-enum : uint64_t { kKeyPixel = 1, kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
+enum : uint64_t { kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
 
 // Thread-seconds by stage. A stage is measured in clock ticks, which are cheap to read thousands
 // of times; the sum is scaled to the block's processor time at the end.
@@ -71,7 +71,7 @@ class StageClock {
 
 struct Counters {
   uint64_t receivers = 0, clusters = 0, cut_nodes = 0, rays = 0, node_visits = 0, splats = 0;
-  uint64_t exact_discs = 0, own_records = 0;
+  uint64_t exact_discs = 0, own_records = 0, sample_records = 0;
   uint64_t skipped_no_receivers = 0, skipped_black = 0, skipped_unlit = 0, skipped_shadow = 0;
   uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
   uint64_t skipped_hidden_nodes = 0, skipped_hidden_subtrees = 0;
@@ -249,8 +249,8 @@ class Renderer final : public FrameRenderer {
           params.spread_open = kMostOpenSpread * all;
           deviation.openness = noise * all;
         }
-        gatherer_->Refine(deviation);
         hierarchy_ = std::make_unique<ReceiverHierarchy>(params, frame_.film.frame(), *gatherer_);
+        gatherer_->Refine(deviation, hierarchy_->finest_strata());
       });
       view = hierarchy_->Prepare(gathered, executor, go_on, counts);
       Stats stats = gatherer_->TakeStats();
@@ -410,16 +410,6 @@ class Renderer final : public FrameRenderer {
     return finite;
   }
 
-  // Position of sample s of a pixel relative to its top left, by the filter; the centre if there
-  // is only one.
-  Vec2f SamplePosition(int x, int y, uint32_t s) const {
-    if (settings_.spp == 1) return {0.5f, 0.5f};
-    const uint32_t seed = static_cast<uint32_t>(
-        HashKey(settings_.seed, kKeyPixel, static_cast<uint64_t>(x), static_cast<uint64_t>(y)));
-    const Vec2f offset = filter_.Sample(OwenSobol(s, 0, seed), OwenSobol(s, 1, seed));
-    return {0.5f + offset.x, 0.5f + offset.y};
-  }
-
   void TracePrimary(const PixelRect& block, std::vector<Sample>& samples,
                     std::vector<Receiver>& receivers, std::vector<uint32_t>& sample_of,
                     Counters& n) const {
@@ -428,7 +418,7 @@ class Renderer final : public FrameRenderer {
     for (int y = block.y0; y < block.y1; ++y) {
       for (int x = block.x0; x < block.x1; ++x) {
         for (uint32_t s = 0; s < settings_.spp; ++s, ++at) {
-          const Vec2f offset = SamplePosition(x, y, s);
+          const Vec2f offset = SamplePosition(filter_, settings_.seed, settings_.spp, x, y, s);
           const Vec3f w =
               rays_.Direction(x + static_cast<double>(offset.x), y + static_cast<double>(offset.y));
           ++n.rays;
@@ -662,36 +652,7 @@ class Renderer final : public FrameRenderer {
         }
       }
     }
-    // Samples beside a pixel's centre may lie on a surface that no candidate saw. Those of a pixel
-    // share what they make.
-    std::vector<ScreenRecord> own;
-    std::vector<const ScreenRecord*> own_list;
-    uint32_t last_pixel = ~0u;
-    for (const uint32_t r : spp > 1 ? BlackLast(samples, sample_of) : std::vector<uint32_t>()) {
-      if (std::exchange(last_pixel, sample_of[r] / spp) != last_pixel) {
-        own.clear();
-        own.reserve(spp);
-        own_list.clear();
-      }
-      Sample& sample = samples[sample_of[r]];
-      if (!wanted[r] || sample.weight >= kServed) continue;
-      const int pixel = static_cast<int>(sample_of[r] / spp);
-      const int x = block.x0 + pixel % block.width(), y = block.y0 + pixel / block.width();
-      const ServedReceiver served{&receivers[r], static_cast<float>(x) + 0.5f,
-                                  static_cast<float>(y) + 0.5f};
-      BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1}, {}, {},
-                   {&sample.openness, size_t{sky_by_records_}});
-      if (sample.weight >= hierarchy_->params().enough) continue;
-      clock.Charge(Stage::kConvolve);
-      own.push_back(hierarchy_->MakeOwnRecord(
-          served, rays_.FootprintAt(receivers[r].position),
-          HashKey(static_cast<uint64_t>(x), static_cast<uint64_t>(y), sample_of[r] % spp)));
-      clock.Skip();
-      own_list.push_back(&own.back());
-      sample.indirect_e = own.back().gather.irradiance;
-      if (sky_by_records_) sample.openness = own.back().gather.openness;
-      ++n.clusters;
-    }
+    if (spp > 1) MakeOwnRecords(block, samples, receivers, sample_of, wanted, n, clock);
     if (sky_by_records_) {
       for (uint32_t r = 0; r < receivers.size(); ++r) {
         Sample& sample = samples[sample_of[r]];
@@ -699,6 +660,63 @@ class Renderer final : public FrameRenderer {
       }
     }
     stats += gatherer_->TakeStats();
+  }
+
+  // Samples beside a pixel's centre may lie on a surface that no candidate saw. Those of a pixel
+  // share what they make.
+  void MakeOwnRecords(const PixelRect& block, std::vector<Sample>& samples,
+                      const std::vector<Receiver>& receivers,
+                      const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
+                      Counters& n, StageClock& clock) const {
+    const uint32_t spp = settings_.spp;
+    const auto lacks = [&](uint32_t r) {
+      return wanted[r] != 0 && !(samples[sample_of[r]].weight >= kServed);
+    };
+    const std::vector<uint32_t> order = BlackLast(samples, sample_of);
+    std::vector<ScreenRecord> own;
+    std::vector<const ScreenRecord*> own_list;
+    for (size_t begin = 0, end; begin < order.size(); begin = end) {
+      // The samples of a pixel that are alike black or not, and how many of them lack records:
+      // those that are not black must not know of the others.
+      const uint32_t pixel = sample_of[order[begin]] / spp;
+      const bool black = IsBlack(samples[sample_of[order[begin]]]);
+      uint32_t left = 0;
+      for (end = begin; end < order.size() && sample_of[order[end]] / spp == pixel &&
+                        IsBlack(samples[sample_of[order[end]]]) == black;
+           ++end) {
+        left += lacks(order[end]);
+      }
+      if (begin == 0 || sample_of[order[begin - 1]] / spp != pixel) {
+        own.clear();
+        own.reserve(spp);
+        own_list.clear();
+      }
+      if (left == 0) continue;
+      const int x = block.x0 + static_cast<int>(pixel) % block.width();
+      const int y = block.y0 + static_cast<int>(pixel) / block.width();
+      for (size_t i = begin; i < end; ++i) {
+        const uint32_t r = order[i];
+        if (!lacks(r)) continue;
+        const float share = static_cast<float>(left--) / static_cast<float>(spp);
+        Sample& sample = samples[sample_of[r]];
+        const ServedReceiver served{&receivers[r], static_cast<float>(x) + 0.5f,
+                                    static_cast<float>(y) + 0.5f};
+        BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1}, {}, {},
+                     {&sample.openness, size_t{sky_by_records_}});
+        if (sample.weight >= hierarchy_->params().enough) continue;
+        clock.Charge(Stage::kConvolve);
+        own.push_back(hierarchy_->MakeOwnRecord(
+            served, rays_.FootprintAt(receivers[r].position),
+            HashKey(static_cast<uint64_t>(x), static_cast<uint64_t>(y), sample_of[r] % spp),
+            share));
+        clock.Skip();
+        own_list.push_back(&own.back());
+        sample.indirect_e = own.back().gather.irradiance;
+        if (sky_by_records_) sample.openness = own.back().gather.openness;
+        ++n.clusters;
+        ++n.sample_records;
+      }
+    }
   }
 
   void Gather(const PixelRect& block, std::vector<Sample>& samples,
@@ -944,6 +962,7 @@ class Renderer final : public FrameRenderer {
     stats.counts["splats"] += n.splats;
     stats.counts["exact_discs"] += n.exact_discs;
     stats.counts["cache_records"] += n.own_records;
+    stats.counts["clusters_of_samples"] += n.sample_records;
     stats.skipped["blocks_without_receivers"] += n.skipped_no_receivers;
     stats.skipped["black_receivers"] += n.skipped_black;
     stats.skipped["unlit_receivers"] += n.skipped_unlit;

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "core/math/elementary.h"
+#include "core/math/sampling.h"
 
 namespace farpoint {
 
@@ -50,6 +51,16 @@ float PixelFilterSampler::Inverse(float u) const {
   const float below = cdf_[i], mass = cdf_[i + 1] - below;
   const float t = mass > 0.0f ? std::clamp((u - below) / mass, 0.0f, 1.0f) : 0.5f;
   return half_width_px_ * (2.0f * (static_cast<float>(i) + t) / kIntervals - 1.0f);
+}
+
+Vec2f SamplePosition(const PixelFilterSampler& filter, uint64_t seed, uint32_t spp, int x, int y,
+                     uint32_t s) {
+  if (spp == 1) return {0.5f, 0.5f};
+  constexpr uint64_t kKeyPixel = 1;
+  const uint32_t scramble = static_cast<uint32_t>(
+      HashKey(seed, kKeyPixel, static_cast<uint64_t>(x), static_cast<uint64_t>(y)));
+  const Vec2f offset = filter.Sample(OwenSobol(s, 0, scramble), OwenSobol(s, 1, scramble));
+  return {0.5f + offset.x, 0.5f + offset.y};
 }
 
 }  // namespace farpoint

@@ -33,4 +33,10 @@ class PixelFilterSampler {
   std::array<float, kIntervals + 1> cdf_{};
 };
 
+// Where sample s of the `spp` of pixel (x, y) lies, from the pixel's top left, in pixels: by the
+// filter, from Owen-scrambled Sobol' points of the pixel and the seed; the centre if there is only
+// one. Samples may lie in neighbouring pixels.
+Vec2f SamplePosition(const PixelFilterSampler& filter, uint64_t seed, uint32_t spp, int x, int y,
+                     uint32_t s);
+
 }  // namespace farpoint

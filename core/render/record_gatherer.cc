@@ -277,8 +277,9 @@ RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& r
   }
 }
 
-void RecordGatherer::Refine(const Means& deviation) {
+void RecordGatherer::Refine(const Means& deviation, uint32_t strata) {
   least_share_ = deviation;
+  strata_ = strata;
   const std::lock_guard lock(mutex_);
   hide_ = hide_ &&
           stats_.skipped["nodes_hidden"] * CutDrawer::kWorthwhilePart >= stats_.counts["cut_nodes"];
@@ -419,7 +420,11 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
 
   uint64_t refined = 0;
   if (least_share_.irradiance > 0 || least_share_.openness > 0) {
-    const std::vector<uint8_t> extra = ExtraRays(grid, samples, least_share_);
+    // Without this the rays that are added would be as many however few strata there are.
+    const float relaxed =
+        std::max(1.0f, static_cast<float>(strata_) / static_cast<float>(grid.size()));
+    const std::vector<uint8_t> extra = ExtraRays(
+        grid, samples, {least_share_.irradiance * relaxed, least_share_.openness * relaxed});
     alignas(32) float x[kMostExtraRays], y[kMostExtraRays], z[kMostExtraRays];
     const auto add = [&](uint32_t i) {
       const size_t at = rays.stratum[i];

@@ -36,9 +36,9 @@ class RecordGatherer final : public PlaceSource {
   // Rounded to quarters of an octave, so that they are the same in most frames of a sequence.
   Means MeanOf(const PixelRect& frame, Executor& executor) const;
   // From now on strata are refined down to these standard deviations; 0: not for its sake. And
-  // cuts leave out what is hidden only if that was worth its while so far. Not to be called while
-  // others gather.
-  void Refine(const Means& deviation);
+  // cuts leave out what is hidden only if that was worth its while so far. Records of fewer than
+  // `strata` strata are refined in proportion less. Not to be called while others gather.
+  void Refine(const Means& deviation, uint32_t strata = 0);
 
   bool ReceiverAt(int x, int y, Receiver& receiver, float& footprint_m) const override;
   bool ReceiverAlong(const CellProbe& probe, ReceiverPlace& place) const override;
@@ -62,6 +62,7 @@ class RecordGatherer final : public PlaceSource {
   const SurfelAtlas* atlas_ = nullptr;     // null: shade every hit
   const SurfelAtlas* indirect_ = nullptr;  // what shaded hits get by further bounces; null: one
   Means least_share_;                      // of standard deviation, for a ray more; 0: none
+  uint32_t strata_ = 0;                    // from which that holds
   bool hide_ = true;                       // leave out of cuts what is hidden
   float near_m_ = 0;                       // hits nearer than this are shaded afresh
   mutable std::mutex mutex_;

@@ -448,5 +448,40 @@ TEST(ReceiverHierarchy, ARecordWithoutReachServesItsOwnReceiver) {
   }
 }
 
+TEST(ReceiverHierarchy, ARecordThatServesAPartOfAPixelHasFewerStrata) {
+  // Tells how many strata it was asked for.
+  class Counting final : public PlaceSource {
+   public:
+    bool ReceiverAt(int, int, Receiver&, float&) const override { return false; }
+    bool ReceiverAlong(const CellProbe&, ReceiverPlace&) const override { return false; }
+    GatherRecord Gather(const Receiver& r, const HemisphereGrid& grid, uint64_t) const override {
+      GatherRecord g;
+      g.position = r.position;
+      g.normal = r.normal;
+      g.irradiance = Rgb(static_cast<float>(grid.size()));
+      g.harmonic_distance_m = 1;
+      return g;
+    }
+  };
+  const Counting source;
+  HierarchyParams params;
+  params.least_samples = 50;
+  const ReceiverHierarchy hierarchy(params, kFrame, source);
+  const Receiver receiver = Floor::At(3, 4);
+  const ServedReceiver served{&receiver, 3.5f, 4.5f};
+  const auto strata = [&](float share) {
+    return hierarchy.MakeOwnRecord(served, 1, 7, share).gather.irradiance.x;
+  };
+  const float all = strata(1);
+  EXPECT_EQ(all, static_cast<float>(hierarchy.finest_strata()));
+  EXPECT_EQ(hierarchy.MakeOwnRecord(served, 1, 7).gather.irradiance.x, all);
+  EXPECT_EQ(strata(0.5f), all);
+  EXPECT_NEAR(strata(0.25f), all / 2, 0.05f * all);
+  EXPECT_EQ(strata(0.125f), strata(0.25f));
+  EXPECT_NEAR(strata(1.0f / 16), all / 4, 0.05f * all);
+  // Not below the least, up to the grid's rounding.
+  EXPECT_GE(strata(1.0f / 256), 45);
+}
+
 }  // namespace
 }  // namespace farpoint

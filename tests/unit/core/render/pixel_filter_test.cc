@@ -71,5 +71,27 @@ TEST(PixelFilter, MomentsAreThoseOfTheFilter) {
   }
 }
 
+TEST(PixelFilter, APixelsSamplesAreItsOwnAndOneIsItsCentre) {
+  const PixelFilterSampler sampler(PixelFilter::kBox, 1);
+  const Vec2f one = SamplePosition(sampler, 5, 1, 3, 4, 0);
+  EXPECT_EQ(one.x, 0.5f);
+  EXPECT_EQ(one.y, 0.5f);
+  // Each quarter of the pixel has one of four.
+  for (const uint64_t seed : {0u, 1u}) {
+    for (int x = 0; x < 8; ++x) {
+      unsigned quarters = 0;
+      for (uint32_t s = 0; s < 4; ++s) {
+        const Vec2f p = SamplePosition(sampler, seed, 4, x, 2, s);
+        ASSERT_GE(p.x, 0);
+        ASSERT_LE(p.x, 1);
+        quarters |= 1u << (2 * (p.x >= 0.5f) + (p.y >= 0.5f));
+      }
+      EXPECT_EQ(quarters, 15u) << x;
+    }
+  }
+  EXPECT_NE(SamplePosition(sampler, 0, 4, 1, 2, 0).x, SamplePosition(sampler, 0, 4, 2, 2, 0).x);
+  EXPECT_NE(SamplePosition(sampler, 0, 4, 1, 2, 0).x, SamplePosition(sampler, 1, 4, 1, 2, 0).x);
+}
+
 }  // namespace
 }  // namespace farpoint
