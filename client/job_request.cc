@@ -121,7 +121,9 @@ absl::StatusOr<PreparedRequest> PrepareRequest(const std::string& scene,
   usage_error = false;
 
   PreparedRequest request{.spec = std::move(file.spec)};
-  FP_ASSIGN_OR_RETURN(request.asset, CollectAsset(file.asset_path));
+  FP_ASSIGN_OR_RETURN(
+      request.asset,
+      CollectAsset(file.asset_path, request.spec.settings.materials == Materials::kGltf));
   if (request.spec.overrides.environment) {
     FP_RETURN_IF_ERROR(AddEnvironment(*request.spec.overrides.environment, request.asset));
   }

@@ -442,6 +442,12 @@ constexpr RenderFlag kRenderFlags[] = {
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.bounces);
      }},
+    {"--materials", "M", kMethod,
+     "lambert: base colours only (the default); gltf: metal, gloss and normal maps too",
+     [](std::string_view value, JobEdit& edit) {
+       FP_ASSIGN_OR_RETURN(edit.spec.settings.materials, MaterialsFromName(value));
+       return absl::OkStatus();
+     }},
     {"--camera", "NAME", kCamera, "a camera of the scene; default: the first",
      [](std::string_view value, JobEdit& edit) {
        if (value.empty()) return Bad("expected the name of a camera of the scene");

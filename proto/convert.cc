@@ -554,6 +554,19 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
     default:
       return Bad(Path(field, "quality"), std::to_string(wire.quality()), "a value of Quality");
   }
+  switch (wire.materials()) {
+    case v1::MATERIALS_UNSPECIFIED:
+      break;
+    case v1::MATERIALS_LAMBERT:
+      settings.materials = Materials::kLambert;
+      break;
+    case v1::MATERIALS_GLTF:
+      settings.materials = Materials::kGltf;
+      break;
+    default:
+      return Bad(Path(field, "materials"), std::to_string(wire.materials()),
+                 "a value of Materials");
+  }
   if (wire.has_filter_width_px()) settings.filter_width_px = wire.filter_width_px();
   if (wire.has_spp()) settings.spp = wire.spp();
   if (wire.has_paths()) settings.paths = wire.paths();
@@ -642,6 +655,14 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
       break;
     case Quality::kFine:
       wire.set_quality(v1::QUALITY_FINE);
+      break;
+  }
+  switch (settings.materials) {
+    case Materials::kLambert:
+      wire.set_materials(v1::MATERIALS_LAMBERT);
+      break;
+    case Materials::kGltf:
+      wire.set_materials(v1::MATERIALS_GLTF);
       break;
   }
   wire.set_filter_width_px(settings.filter_width_px);

@@ -55,6 +55,7 @@ class CoreBaker final : public SceneBaker {
       const SceneOverrides& o = spec.overrides;
       EnsureCameraAndLight(imported, /*light_chosen=*/!o.suns.empty() || !o.lights.empty() ||
                                          o.sky.has_value() || o.environment.has_value());
+      if (spec.settings.materials == Materials::kLambert) NoteHiddenGloss(imported);
     }
     FP_RETURN_IF_ERROR(CheckNotStopped(cancel));
 
@@ -82,6 +83,7 @@ class CoreBaker final : public SceneBaker {
     options.light_units = spec.light_units;
     options.max_triangles = spec.limits.max_triangles;
     options.time_s = time_s;
+    options.gloss = spec.settings.materials == Materials::kGltf;
     FP_ASSIGN_OR_RETURN(ImportedScene imported, ImportScene(asset, options));
     FP_RETURN_IF_ERROR(ApplyOverrides(spec.overrides, asset, imported.scene));
     return imported;

@@ -31,6 +31,11 @@ int main(int argc, char** argv) {
     return command;
   };
   CLI::App* cornell = add("cornell", "The Cornell box as measured");
+  CLI::App* gloss = add("gloss", "The Cornell box with a block of copper and a sphere of plastic");
+  float roughness = 0.3f;
+  gloss->add_option("--roughness", roughness, "Of both")
+      ->check(CLI::Range(0.0, 1.0))
+      ->capture_default_str();
   CLI::App* furnace = add("furnace", "A closed box that glows");
   float rho = 0.5f, radiance = 1;
   furnace->add_option("--rho", rho, "Reflectance")
@@ -52,6 +57,7 @@ int main(int argc, char** argv) {
     return app.exit(e) == 0 ? 0 : 2;
   }
   if (cornell->parsed()) return Write(farpoint::MakeCornellBox(), output);
+  if (gloss->parsed()) return Write(farpoint::MakeGlossyCornellBox(roughness), output);
   if (furnace->parsed()) return Write(farpoint::MakeFurnace(rho, radiance), output);
   return Write(farpoint::MakeCity(blocks, seed), output);
 }

@@ -24,6 +24,10 @@ constexpr std::array<Names, 3> kDirectIrradianceChannels = {
 constexpr std::array<Names, 3> kStdErrorChannels = {"stderr.R", "stderr.G", "stderr.B"};
 constexpr std::array<Names, 1> kClusterChannels = {"cluster.Y"};
 constexpr std::array<Names, 1> kCutSizeChannels = {"cutsize.Y"};
+constexpr std::array<Names, 3> kDiffuseIndirectChannels = {
+    "diffuse_indirect.R", "diffuse_indirect.G", "diffuse_indirect.B"};
+constexpr std::array<Names, 3> kGlossyIndirectChannels = {"glossy_indirect.R", "glossy_indirect.G",
+                                                          "glossy_indirect.B"};
 
 // What is looked at is stored in half; what is measured or indexed, in float.
 constexpr std::array<LayerInfo, kLayerCount> kLayers = {{
@@ -40,6 +44,8 @@ constexpr std::array<LayerInfo, kLayerCount> kLayers = {{
     {Layer::kStdError, "stderr", kStdErrorChannels, false, false},
     {Layer::kCluster, "cluster", kClusterChannels, false, false},
     {Layer::kCutSize, "cutsize", kCutSizeChannels, false, false},
+    {Layer::kDiffuseIndirect, "diffuse_indirect", kDiffuseIndirectChannels, true, false},
+    {Layer::kGlossyIndirect, "glossy_indirect", kGlossyIndirectChannels, true, false},
 }};
 
 // Levenshtein distance.

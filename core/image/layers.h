@@ -17,7 +17,7 @@ enum class Layer : uint32_t {
   kDirect,            // radiance from reflected direct light
   kIndirect,          // radiance from reflected indirect light
   kEmission,          // emitted radiance; the background's too
-  kAlbedo,            // Lambert reflectance
+  kAlbedo,            // Lambert reflectance; of what is glossy its mean over all directions
   kNormal,            // N.X N.Y N.Z: shading normal, world, unit, towards the viewer; 0: background
   kPosition,          // P.X P.Y P.Z: world, metres; 0: background
   kDepth,             // Z: distance along the camera's axis, metres; +inf: background
@@ -26,8 +26,10 @@ enum class Layer : uint32_t {
   kStdError,          // standard error of kIrradiance (pt only)
   kCluster,  // index of the receiver's cluster within its block, averaged over samples; -1: none
   kCutSize,  // nodes in the receiver's own cut, mean over samples
+  kDiffuseIndirect,  // the part of kIndirect that the diffuse base reflects; all of it on Lambert
+  kGlossyIndirect,   // the rest: what interfaces of dielectrics and metals reflect
 };
-inline constexpr int kLayerCount = 13;
+inline constexpr int kLayerCount = 15;
 
 struct LayerInfo {
   Layer layer;

@@ -67,6 +67,22 @@ F8 Gather8(const float* p, const std::array<int64_t, 8>& offset) {
 // The least power of a light beside one of power 1 that keeps it a normal number.
 constexpr float kLeastPower = 0x1p-100f;
 
+// Of the environment, over the sphere.
+float MeanLuminance(const PreparedScene& scene) {
+  const uint32_t width = scene.map_width(), height = scene.map_height();
+  double sum = 0;
+  for (uint32_t y = 0; y < height; ++y) {
+    double row = 0;
+    for (uint32_t x = 0; x < width; ++x)
+      row += static_cast<double>(Luminance(scene.MapTexel(x, y)));
+    // cos of the latitudes of its edges, from the top: the row's share of the sphere is their
+    // difference over two.
+    const double share = DetSinCos(kPi * y / height).cos - DetSinCos(kPi * (y + 1) / height).cos;
+    sum += 0.5 * share * row / width;
+  }
+  return static_cast<float>(sum) + Luminance(scene.sky());
+}
+
 float InversePowerOfTwo(float x) {
   int exponent = 0;
   std::frexp(x, &exponent);
@@ -153,6 +169,7 @@ LightSampler::EmitterDirections LightSampler::Directions(const EmitterSamples& s
   out.any &= cos_l * height > zero;
   out.direction = w;
   out.distance_m = height / cos_l;
+  out.solid_angle = Max8(solid_angle, least);
   out.inverse_pdf_sr = solid_angle * (draw_u.twice_mean * draw_v.twice_mean) /
                        (draw_u.twice_value * draw_v.twice_value);
 
@@ -173,7 +190,10 @@ LightSampler::LightSampler(std::shared_ptr<const RayAccel> accel) : accel_(std::
   const PreparedScene& scene = accel_->scene();
   AddEmitters();
   AddPunctualLights();
-  if (scene.has_environment_map()) environment_ = std::make_unique<EnvironmentSampler>(scene);
+  if (scene.has_environment_map()) {
+    environment_ = std::make_unique<EnvironmentSampler>(scene);
+    if (scene.has_gloss()) mean_sky_ = MeanLuminance(scene);
+  }
   has_sky_ = scene.has_environment_map() || MaxComponent(scene.sky()) > 0.0f;
   any_light_ =
       has_sky_ || !directional_lights_.empty() || !positioned_lights_.empty() || !emitters_.empty();
@@ -224,6 +244,7 @@ void LightSampler::AddEmitters() {
     if (order[i] == LightTree::kNone) continue;
     const Emitter& e = found[order[i]];
     emitters_[i] = e;
+    if (scene.has_gloss()) place_of_emitter_.emplace_back(e.triangle, static_cast<uint32_t>(i));
     EmitterBlock& block = emitter_blocks_[i / LightTree::kWidth];
     const size_t k = i % LightTree::kWidth;
     const auto& v = scene.triangles()[e.triangle].vertex;
@@ -236,6 +257,7 @@ void LightSampler::AddEmitters() {
     block.twice_area[k] = 2.0f * e.area_m2;
     block.luminance[k] = luminance[order[i]];
   }
+  std::sort(place_of_emitter_.begin(), place_of_emitter_.end());
 }
 
 void LightSampler::AddPunctualLights() {
@@ -432,8 +454,23 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
 Rgb LightSampler::Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t key,
                              uint32_t first_index, unsigned dimension, LightCounters& counters,
                              bool refine, bool environment, unsigned needless) const {
-  const Query q{at.p,    at.ng, at.n,        at.Leave(), at.offset_m,
-                samples, key,   first_index, dimension,  needless};
+  return Estimate(
+      {at.p, at.ng, at.n, at.Leave(), at.offset_m, samples, key, first_index, dimension, needless},
+      refine, environment, counters);
+}
+
+Rgb LightSampler::Reflected(const SurfacePoint& at, const Reflector& reflector, uint32_t samples,
+                            uint64_t key, uint32_t first_index, unsigned dimension,
+                            LightCounters& counters, bool refine, bool environment,
+                            unsigned needless) const {
+  return Estimate({at.p, at.ng, at.n, at.Leave(), at.offset_m, samples, key, first_index, dimension,
+                   needless, &reflector},
+                  refine, environment, counters);
+}
+
+Rgb LightSampler::Estimate(const Query& q, bool refine, bool environment,
+                           LightCounters& counters) const {
+  const unsigned needless = q.needless;
   Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
     irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
@@ -539,6 +576,9 @@ Rgb LightSampler::FromPunctual(const PreparedLight& light, const Query& q,
     ++counters.blocked;
     return {};
   }
+  if (q.reflector != nullptr) {
+    arriving *= q.reflector->Toward(to_light, std::numeric_limits<float>::infinity());
+  }
   return arriving * cosine;
 }
 
@@ -631,7 +671,7 @@ Rgb LightSampler::FromEmitters(const Query& q, LightCounters& counters) const {
         samples.Set(k, u, emitter_tree_.Choose(q.origin, q.n, u, cache, weigh));
       }
     }
-    ShadowRays8 rays = RaysTo(samples);
+    ShadowRays8 rays = RaysTo(samples, q.reflector);
     counters.samples += count;
     for (unsigned rest = ((1u << count) - 1u) & ~rays.active; rest != 0; rest &= rest - 1) {
       const auto k = static_cast<size_t>(std::countr_zero(rest));
@@ -676,7 +716,8 @@ LightSampler::EmitterSamples LightSampler::SampleEach(const SurfacePoints8& poin
   return samples;
 }
 
-LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) const {
+LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples,
+                                               const Reflector* reflector) const {
   const FpTrapPause pause;  // lanes that are left out
   const EmitterDirections to = Directions(samples);
   const F8 zero = Set8(0.0f);
@@ -700,6 +741,10 @@ LightSampler::ShadowRays8 LightSampler::RaysTo(const EmitterSamples& samples) co
       radiance =
           e.RadianceAt(accel_->scene(), rays.origin[k] + rays.direction[k] * to.distance_m[k]);
       // Black, or a hole of an alpha mask.
+      if (!(MaxComponent(radiance) > 0.0f)) rays.active &= ~(1u << k);
+    }
+    if (reflector != nullptr) {
+      radiance *= reflector->Toward(rays.direction[k], samples.probability[k] / to.solid_angle[k]);
       if (!(MaxComponent(radiance) > 0.0f)) rays.active &= ~(1u << k);
     }
     rays.arriving.SetLane(k, radiance);
@@ -741,6 +786,7 @@ Rgb LightSampler::FromSky(const Query& q, LightCounters& counters) const {
   const uint32_t seed = static_cast<uint32_t>(HashKey(q.key, 2));
   const Frame frame(q.n);
   uint32_t open = 0;
+  Rgb reflected;
   for (uint32_t i = 0; i < q.samples; ++i) {
     const Vec3f w =
         frame.ToWorld(CosineHemisphere(OwenSobol(q.first_index + i, q.dimension, seed),
@@ -754,7 +800,13 @@ Rgb LightSampler::FromSky(const Query& q, LightCounters& counters) const {
       ++counters.blocked;
     } else {
       ++open;
+      if (q.reflector != nullptr) {
+        reflected += q.reflector->Toward(w, std::max(Dot(q.n, w), 0.0f) * kInvPif);
+      }
     }
+  }
+  if (q.reflector != nullptr) {
+    return accel_->scene().sky() * reflected * (kPif / static_cast<float>(q.samples));
   }
   return accel_->scene().sky() * (kPif * static_cast<float>(open) / static_cast<float>(q.samples));
 }
@@ -777,10 +829,52 @@ Rgb LightSampler::FromMap(const Query& q, LightCounters& counters) const {
     if (accel_->Occluded(q.origin, draw->direction)) {
       ++counters.blocked;
     } else {
-      sum += draw->contribution;
+      sum += q.reflector == nullptr
+                 ? draw->contribution
+                 : draw->contribution *
+                       q.reflector->Toward(draw->direction, MapDensity(q.n, draw->direction));
     }
   }
   return sum / static_cast<float>(q.samples);
+}
+
+// Nearly: in proportion to luminance and cosine.
+float LightSampler::MapDensity(const Vec3f& n, const Vec3f& w) const {
+  const float cosine = Dot(n, w);
+  if (!(cosine > 0.0f) || !(mean_sky_ > 0.0f)) return 0;
+  return Luminance(accel_->scene().EnvironmentRadiance(w)) * cosine / (kPif * mean_sky_);
+}
+
+LightSampler::Seen LightSampler::EnvironmentSeen(const SurfacePoint& from, const Vec3f& w) const {
+  if (!has_sky_) return {};
+  const Rgb radiance = accel_->scene().EnvironmentRadiance(w);
+  return {radiance, environment_ != nullptr ? MapDensity(from.n, w)
+                                            : std::max(Dot(from.n, w), 0.0f) * kInvPif};
+}
+
+LightSampler::Seen LightSampler::EmissionSeen(const SurfacePoint& from, const RayHit& hit) const {
+  const PreparedScene& scene = accel_->scene();
+  if (!(MaxComponent(scene.MaterialOf(hit.triangle).emission) > 0.0f)) return {};
+  Seen seen{scene.Surface(hit.triangle, hit.b1, hit.b2).emission, 0};
+  const auto found = std::lower_bound(place_of_emitter_.begin(), place_of_emitter_.end(),
+                                      std::pair(hit.triangle, uint32_t{0}));
+  if (found == place_of_emitter_.end() || found->first != hit.triangle) return seen;
+  const Vec3f origin = from.Leave();
+  LightTree::Cache cache;
+  const double probability = emitter_tree_.ProbabilityOf(
+      found->second, origin, from.n, cache, [&](uint32_t block, LightTree::Weights& weights) {
+        Weigh(emitter_blocks_[block], origin, from.n, weights);
+      });
+  EmitterSamples sample;
+  sample.origin = V8(origin);
+  sample.n = V8(from.n);
+  sample.ng = V8(from.ng);
+  sample.v = Set8(0.5f);
+  sample.u = Set8(0.5f);
+  sample.place = U8{} + found->second;
+  const FpTrapPause pause;  // lanes that are left out
+  seen.density_sr = static_cast<float>(probability) / Directions(sample).solid_angle[0];
+  return seen;
 }
 
 }  // namespace farpoint

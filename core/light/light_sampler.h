@@ -12,6 +12,7 @@
 #include <memory>
 #include <optional>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "core/accel/ray_accel.h"
@@ -49,6 +50,17 @@ struct SurfacePoints8 {
 enum NeedlessLight : unsigned {
   kNeedlessRays = 1u << 0,         // shadow rays of lights that cannot reach
   kNeedlessEnvironment = 1u << 1,  // rays to an environment that is not there
+};
+
+// What light from a direction counts for, in place of the 1 of irradiance: a BRDF, times the weight
+// that this way of sampling has among others (Veach and Guibas 1995).
+class Reflector {
+ public:
+  virtual ~Reflector() = default;
+  // `w`: unit, world, above the horizons of both normals. `density_sr`: by which a sample of the
+  // estimate takes about this direction, infinite for lights without extent; it is the one that
+  // LightSampler::EmissionSeen and EnvironmentSeen tell.
+  virtual Rgb Toward(const Vec3f& w, float density_sr) const = 0;
 };
 
 // Immutable; thread-safe.
@@ -89,6 +101,22 @@ class LightSampler {
                  unsigned dimension, LightCounters& counters, bool refine = false,
                  bool environment = true, unsigned needless = 0) const;
 
+  // The same estimate of ∫ L reflector cosθ dω: the reflected radiance where the reflector is a
+  // BRDF [W/(m² sr)].
+  Rgb Reflected(const SurfacePoint& at, const Reflector& reflector, uint32_t samples, uint64_t key,
+                uint32_t first_index, unsigned dimension, LightCounters& counters,
+                bool refine = false, bool environment = true, unsigned needless = 0) const;
+
+  // What a ray finds that somebody else drew, for estimates that combine their rays with these.
+  struct Seen {
+    Rgb radiance;          // W/(m² sr)
+    float density_sr = 0;  // what a Reflector at the ray's start would be told; 0: no such sample
+  };
+  // The emission of what the ray along `w` from `from.Leave()` hits.
+  Seen EmissionSeen(const SurfacePoint& from, const RayHit& hit) const;
+  // The environment along the unit direction `w`, where nothing is hit.
+  Seen EnvironmentSeen(const SurfacePoint& from, const Vec3f& w) const;
+
   static constexpr uint32_t kRefined = 16, kFewestRefined = 4;
 
   // Irradiance(at, 1, key, index, dimension, counters) of each active lane, to the same bits,
@@ -108,7 +136,9 @@ class LightSampler {
     uint32_t first_index;
     unsigned dimension;
     unsigned needless = 0;
+    const Reflector* reflector = nullptr;
   };
+  Rgb Estimate(const Query& q, bool refine, bool environment, LightCounters& counters) const;
   // A ray that cannot matter: counted, or traced for nothing.
   void Skip(const Query& q, const Vec3f& direction, float reach_m, LightCounters& counters) const;
   // Of one of the From… below: its estimate, and in a penumbra a finer one.
@@ -170,6 +200,7 @@ class LightSampler {
     F8 height_m;        // of the origin over the emitter's plane, > 0
     F8 offset_m;        // SurfaceOffset of the emitter, seen from the origin
     F8 inverse_pdf_sr;  // 1 / density per solid angle, given the emitter
+    F8 solid_angle;     // of the emitter; of small ones to a part in a thousand
     M8 any;
   };
   EmitterLanes LoadEmitters(const U8& place) const;
@@ -182,7 +213,7 @@ class LightSampler {
     V8 arriving;
     unsigned active;
   };
-  ShadowRays8 RaysTo(const EmitterSamples& samples) const;
+  ShadowRays8 RaysTo(const EmitterSamples& samples, const Reflector* reflector = nullptr) const;
   // Traces the rays: nothing arrives where they are blocked. `from_one_point`: all have one origin.
   void Trace(ShadowRays8& rays, bool from_one_point, LightCounters& counters) const;
   // One sample for each point.
@@ -204,12 +235,14 @@ class LightSampler {
   Rgb FromEmitters(const Query& q, LightCounters& counters) const;
   Rgb FromSky(const Query& q, LightCounters& counters) const;
   Rgb FromMap(const Query& q, LightCounters& counters) const;
+  float MapDensity(const Vec3f& n, const Vec3f& w) const;
 
   std::shared_ptr<const RayAccel> accel_;
   std::vector<Emitter> emitters_;  // by place in the tree's order; empty places have area 0
   std::vector<EmitterBlock> emitter_blocks_;
   LightTree emitter_tree_;
   uint32_t emitter_count_ = 0;
+  std::vector<std::pair<uint32_t, uint32_t>> place_of_emitter_;  // by triangle, ascending
   // Those with power; the positioned ones by place in the tree's order, empty places black.
   std::vector<PreparedLight> directional_lights_, positioned_lights_;
   uint32_t positioned_count_ = 0;
@@ -217,6 +250,7 @@ class LightSampler {
   LightTree punctual_tree_;
   std::unique_ptr<const EnvironmentSampler> environment_;
   bool has_sky_ = false;
+  float mean_sky_ = 0;  // luminance, over the sphere; of an environment map with the sky
   bool any_light_ = false;
 };
 

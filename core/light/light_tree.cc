@@ -161,6 +161,7 @@ LightTree::LightTree(std::span<const LightBounds> lights, Emission emission) : e
   for (uint32_t i = 0; i < items.size(); ++i) items[i] = i;
   LightBounds bounds;
   root_ = Build(lights, items, 0, bounds);
+  FindParents();
 }
 
 uint32_t LightTree::Build(std::span<const LightBounds> lights, std::span<uint32_t> items,
@@ -213,6 +214,37 @@ uint32_t LightTree::Build(std::span<const LightBounds> lights, std::span<uint32_
   }
   nodes_[at] = node;
   return at;
+}
+
+double LightTree::ProbabilityInBlock(const Weights& weights, uint32_t chosen) {
+  double total = 0;
+  uint32_t positive = 0;
+  for (const float w : weights) {
+    total += static_cast<double>(w);
+    positive += w > 0 ? 1u : 0u;
+  }
+  if (!(total > 0) || !(weights[chosen] > 0)) return 0;
+  double sum = 0, before = 0, below = 0;
+  for (uint32_t k = 0; k <= chosen; ++k) {
+    if (!(weights[k] > 0)) continue;
+    sum += static_cast<double>(weights[k]);
+    before = below;
+    below = sum / total;
+    if (positive == 2 && sum < total) below = AtAnEighth(below);
+  }
+  return below - before;
+}
+
+void LightTree::FindParents() {
+  parent_of_node_.resize(nodes_.size());
+  parent_of_block_.resize(order_.size() / kWidth);
+  for (uint32_t i = 0; i < nodes_.size(); ++i) {
+    for (uint32_t k = 0; k < kWidth; ++k) {
+      if (!(nodes_[i].power[k] > 0)) continue;
+      const uint32_t child = nodes_[i].child[k];
+      ((child & kBlock) != 0 ? parent_of_block_[child & ~kBlock] : parent_of_node_[child]) = {i, k};
+    }
+  }
 }
 
 LightTree::Choices8 LightTree::ChooseInBlock8(std::span<const F8> weights, const U8& u_bits) {

@@ -77,6 +77,10 @@ class LightTree {
   template <typename BlockWeights>
   std::optional<Choice> Choose(const Vec3f& p, const Vec3f& n, double& u, Cache& cache,
                                const BlockWeights& block_weights) const;
+  // The probability by which Choose takes the light at `place` (not an empty one).
+  template <typename BlockWeights>
+  double ProbabilityOf(uint32_t place, const Vec3f& p, const Vec3f& n, Cache& cache,
+                       const BlockWeights& block_weights) const;
   // True of up to eight lights: Choose is then ChooseInBlock of the weights of block 0.
   bool is_one_block() const { return root_ == kBlock; }
   static std::optional<Choice> ChooseInBlock(const Weights& weights, double& u);
@@ -108,11 +112,22 @@ class LightTree {
   uint32_t Build(std::span<const LightBounds> lights, std::span<uint32_t> items, unsigned depth,
                  LightBounds& bounds);
   void NodeWeights(const Node& node, const Vec3f& p, const Vec3f& n, Weights& weights) const;
+  // Of the children of the node, or the lights of the block, `at`.
+  template <typename BlockWeights>
+  const Weights& WeightsOf(uint32_t at, const Vec3f& p, const Vec3f& n, Cache& cache,
+                           const BlockWeights& block_weights) const;
+  // By which ChooseInBlock takes `chosen`.
+  static double ProbabilityInBlock(const Weights& weights, uint32_t chosen);
+  void FindParents();
 
   Emission emission_ = Emission::kCone;
   uint32_t root_ = kNone;
   std::vector<Node> nodes_;
   std::vector<uint32_t> order_;
+  struct Parent {
+    uint32_t node = kNone, child = 0;
+  };
+  std::vector<Parent> parent_of_node_, parent_of_block_;
 };
 
 inline std::optional<LightTree::Choice> LightTree::ChooseInBlock(const Weights& weights,
@@ -149,37 +164,56 @@ std::optional<LightTree::Choice> LightTree::Choose(const Vec3f& p, const Vec3f& 
   uint32_t at = root_;
   if (at == kNone) return std::nullopt;
   for (;;) {
-    const bool is_block = (at & kBlock) != 0;
     const uint32_t index = at & ~kBlock;
-    const uint32_t slot = Cache::SlotOf(at);
-    Weights& weight = cache.weight_[slot];
-    if (cache.key_[slot] != at) {
-      cache.key_[slot] = at;
-      if (is_block) {
-        block_weights(index, weight);
-      } else {
-        const Node& node = nodes_[index];
-        alignas(32) Weights bound, below;
-        NodeWeights(node, p, n, bound);
-        for (uint32_t k = 0; k < kWidth; ++k) {
-          weight[k] = 0;
-          if (!(bound[k] > 0)) continue;
-          const uint32_t child = node.child[k];
-          if ((child & kBlock) != 0) {
-            block_weights(child & ~kBlock, below);
-          } else {
-            NodeWeights(nodes_[child], p, n, below);
-          }
-          for (const float w : below) weight[k] += w;
-        }
-      }
-    }
-    const std::optional<Choice> step = ChooseInBlock(weight, u);
+    const std::optional<Choice> step = ChooseInBlock(WeightsOf(at, p, n, cache, block_weights), u);
     if (!step) return std::nullopt;
     probability *= step->probability;
-    if (is_block) return Choice{index * kWidth + step->place, probability};
+    if ((at & kBlock) != 0) return Choice{index * kWidth + step->place, probability};
     at = nodes_[index].child[step->place];
   }
+}
+
+template <typename BlockWeights>
+const LightTree::Weights& LightTree::WeightsOf(uint32_t at, const Vec3f& p, const Vec3f& n,
+                                               Cache& cache,
+                                               const BlockWeights& block_weights) const {
+  const uint32_t index = at & ~kBlock;
+  const uint32_t slot = Cache::SlotOf(at);
+  Weights& weight = cache.weight_[slot];
+  if (cache.key_[slot] == at) return weight;
+  cache.key_[slot] = at;
+  if ((at & kBlock) != 0) {
+    block_weights(index, weight);
+    return weight;
+  }
+  const Node& node = nodes_[index];
+  alignas(32) Weights bound, below;
+  NodeWeights(node, p, n, bound);
+  for (uint32_t k = 0; k < kWidth; ++k) {
+    weight[k] = 0;
+    if (!(bound[k] > 0)) continue;
+    const uint32_t child = node.child[k];
+    if ((child & kBlock) != 0) {
+      block_weights(child & ~kBlock, below);
+    } else {
+      NodeWeights(nodes_[child], p, n, below);
+    }
+    for (const float w : below) weight[k] += w;
+  }
+  return weight;
+}
+
+template <typename BlockWeights>
+double LightTree::ProbabilityOf(uint32_t place, const Vec3f& p, const Vec3f& n, Cache& cache,
+                                const BlockWeights& block_weights) const {
+  const uint32_t block = place / kWidth;
+  double probability =
+      ProbabilityInBlock(WeightsOf(block | kBlock, p, n, cache, block_weights), place % kWidth);
+  for (Parent at = parent_of_block_[block]; at.node != kNone && probability > 0;
+       at = parent_of_node_[at.node]) {
+    probability *= ProbabilityInBlock(WeightsOf(at.node, p, n, cache, block_weights), at.child);
+  }
+  return probability;
 }
 
 }  // namespace farpoint

@@ -113,6 +113,13 @@ float SpacingFor(const RenderSettings& settings, const SurfaceSize& size,
                                kMostPerTriangle * prepared.triangles().size());
 }
 
+PrepareOptions PrepareOptionsOf(const RenderSettings& settings) {
+  PrepareOptions options;
+  options.all_textures = !settings.skips(kSkipTextures);
+  options.gloss = settings.materials == Materials::kGltf;
+  return options;
+}
+
 // The stages after the prepared scene.
 class TreeBake {
  public:
@@ -317,7 +324,7 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
   {
     StageTimer timer(stats, Stage::kImport);
     FP_ASSIGN_OR_RETURN(prepared,
-                        PreparedScene::Prepare(scene, executor, {!settings.skips(kSkipTextures)}));
+                        PreparedScene::Prepare(scene, executor, PrepareOptionsOf(settings)));
     baked.prepared_scene = prepared->blob();
   }
   stats.skipped["textures"] += prepared->skipped_textures();
@@ -331,7 +338,8 @@ absl::StatusOr<BakedScene> Bake(const Scene& scene, const RenderSettings& settin
 
 absl::StatusOr<float> SurfelSpacing(const Scene& scene, const RenderSettings& settings,
                                     Executor& executor) {
-  FP_ASSIGN_OR_RETURN(const auto prepared, PreparedScene::Prepare(scene, executor));
+  FP_ASSIGN_OR_RETURN(const auto prepared,
+                      PreparedScene::Prepare(scene, executor, PrepareOptionsOf(settings)));
   return SpacingFor(
       settings,
       SizeOf(MakeObjectShapes(scene, *prepared, executor), RepeatedObjects(*prepared, executor)),

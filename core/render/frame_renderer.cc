@@ -21,6 +21,9 @@
 #include "core/pbgi/receiver_hierarchy.h"
 #include "core/pbgi/tree_cut.h"
 #include "core/render/camera_rays.h"
+#include "core/render/glossy_gatherer.h"
+#include "core/render/glossy_path_tracer.h"
+#include "core/render/glossy_point.h"
 #include "core/render/loaded_scene.h"
 #include "core/render/path_tracer.h"
 #include "core/render/pixel_filter.h"
@@ -40,7 +43,7 @@ constexpr float kMostSpread = 0.15f, kMostDraftSpread = 0.4f;
 constexpr float kMostOpenSpread = 0.05f;
 
 // Keys of independent random choices.
-enum : uint64_t { kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4 };
+enum : uint64_t { kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4, kKeyGloss = 5 };
 
 // Thread-seconds by stage. A stage is measured in clock ticks, which are cheap to read thousands
 // of times; the sum is scaled to the block's processor time at the end.
@@ -76,6 +79,7 @@ struct Counters {
   uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
   uint64_t skipped_hidden_nodes = 0, skipped_hidden_subtrees = 0;
   uint64_t skipped_environments = 0, skipped_black_hits = 0;
+  uint64_t glossy_receivers = 0, skipped_matte = 0;
 };
 
 // One image sample: where the primary ray went.
@@ -88,6 +92,10 @@ struct Sample {
   float cluster = -1, cut_size = 0;
   float weight = 0, heaviest = 0;  // of the records that serve it, adaptive clusters
   float openness = 0;              // as they blend it, if the sky's light comes from them
+  // Of glossy receivers: their index in Primary::glossy, what the diffuse base reflects of
+  // irradiance, and radiance, W/(m² sr), in place of albedo E / pi.
+  int32_t glossy = -1;
+  Rgb diffuse_albedo, direct_l, diffuse_l, glossy_l;
 };
 
 // A block's samples, and what they hit.
@@ -96,6 +104,7 @@ struct Primary {
   std::vector<Receiver> receivers;
   std::vector<uint32_t> sample_of;  // of each receiver
   std::vector<uint8_t> wanted;      // by receiver: its pixel lies in the tile
+  std::vector<GlossyPoint> glossy;  // by Sample::glossy
 };
 
 // Tiles of more samples than this do not keep what their primary rays hit while records are made.
@@ -174,8 +183,9 @@ class Renderer final : public FrameRenderer {
     wants_cluster_ = wants(Layer::kCluster) || wants(Layer::kCutSize);
     // Who asks for the size of cuts asks for that of whole ones.
     hide_ = settings_.skips(kSkipHidden) && !wants(Layer::kCutSize);
-    wants_indirect_ = wants_irradiance_ || wants(Layer::kIndirect) || wants(Layer::kBeauty) ||
-                      wants(Layer::kCluster);
+    wants_indirect_ = wants_irradiance_ || wants(Layer::kDiffuseIndirect) ||
+                      wants(Layer::kGlossyIndirect) || wants(Layer::kIndirect) ||
+                      wants(Layer::kBeauty) || wants(Layer::kCluster);
     wants_direct_ = wants_direct_irradiance_ || wants(Layer::kDirect) || wants(Layer::kBeauty);
     // Records see how much of a constant sky is open with the rays that they trace anyway, many
     // more than a receiver has shadow rays. Also where nobody asks for direct light: what records
@@ -184,6 +194,7 @@ class Renderer final : public FrameRenderer {
                       !scene_.scene->has_environment_map() &&
                       MaxComponent(scene_.scene->sky()) > 0.0f && scene_.tree != nullptr &&
                       scene_.tree->lit();
+    if (scene_.scene->has_gloss()) glossy_ = std::make_unique<GlossyGatherer>(scene_, settings_);
     if (settings_.integrator == Integrator::kFpbgi ||
         settings_.integrator == Integrator::kIrrcache) {
       gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_,
@@ -320,7 +331,7 @@ class Renderer final : public FrameRenderer {
     Counters n;
     const uint32_t spp = settings_.spp;
     out.samples.resize(static_cast<size_t>(block.area()) * spp);
-    TracePrimary(block, out.samples, out.receivers, out.sample_of, n);
+    TracePrimary(block, out, n);
     const PixelRect inside = block.Intersect(tile);
     out.wanted.resize(out.receivers.size());
     for (size_t r = 0; r < out.receivers.size(); ++r) {
@@ -340,7 +351,9 @@ class Renderer final : public FrameRenderer {
   bool GathersBlack() const {
     return wants_irradiance_ || wants_cluster_ || (sky_by_records_ && wants_direct_irradiance_);
   }
-  static bool IsBlack(const Sample& sample) { return !(MaxComponent(sample.albedo) > 0.0f); }
+  static bool IsBlack(const Sample& sample) {
+    return !(MaxComponent(sample.glossy < 0 ? sample.albedo : sample.diffuse_albedo) > 0.0f);
+  }
 
   // The part of the tile that holds all blocks with receivers that gather.
   PixelRect WhereLightIsGathered(std::span<const PixelRect> blocks, const PixelRect& tile,
@@ -368,23 +381,29 @@ class Renderer final : public FrameRenderer {
     StageClock clock;
     Counters n;
     const PixelRect inside = block.Intersect(tile);
-    auto& [samples, receivers, sample_of, wanted] = primary;
+    auto& [samples, receivers, sample_of, wanted, glossy] = primary;
     if (wants_direct_ && scene_.lights->any_light()) {
       Direct(block, samples, receivers, sample_of, wanted, n);
     }
     clock.Charge(Stage::kDirect);
+    if (glossy_ != nullptr) {
+      ReflectGloss(block, primary, n, stats);
+      clock.Charge(Stage::kTrace);
+    }
 
     if (WantsGather() && !receivers.empty()) {
       if (!GathersBlack() && settings_.skips(kSkipBlack)) {
         for (size_t r = 0; r < receivers.size(); ++r) {
-          if (wanted[r] && IsBlack(samples[sample_of[r]])) {
+          const Sample& sample = samples[sample_of[r]];
+          const bool by_paths = settings_.integrator == Integrator::kPt && sample.glossy >= 0;
+          if (wanted[r] && IsBlack(sample) && !by_paths) {
             wanted[r] = 0;
             ++n.skipped_black;
           }
         }
       }
       if (settings_.integrator == Integrator::kPt) {
-        TracePaths(block, samples, receivers, sample_of, wanted, n);
+        TracePaths(block, primary, n);
         clock.Charge(Stage::kTrace);
       } else if (settings_.integrator == Integrator::kIrrcache) {
         if (cache != nullptr) {
@@ -402,6 +421,12 @@ class Renderer final : public FrameRenderer {
       }
     }
 
+    if (settings_.integrator != Integrator::kPt) {
+      for (Sample& sample : samples) {
+        if (sample.glossy < 0) continue;
+        sample.diffuse_l = sample.diffuse_albedo * sample.indirect_e * kInvPif;
+      }
+    }
     const bool finite = Develop(block, inside, samples, receivers, film);
     clock.Charge(Stage::kConvolve);
     clock.Finish(stats);
@@ -410,10 +435,9 @@ class Renderer final : public FrameRenderer {
     return finite;
   }
 
-  void TracePrimary(const PixelRect& block, std::vector<Sample>& samples,
-                    std::vector<Receiver>& receivers, std::vector<uint32_t>& sample_of,
-                    Counters& n) const {
+  void TracePrimary(const PixelRect& block, Primary& out, Counters& n) const {
     const PreparedScene& scene = *scene_.scene;
+    auto& [samples, receivers, sample_of, wanted, glossy] = out;
     size_t at = 0;
     for (int y = block.y0; y < block.y1; ++y) {
       for (int x = block.x0; x < block.x1; ++x) {
@@ -435,6 +459,11 @@ class Renderer final : public FrameRenderer {
           sample.receiver = static_cast<uint32_t>(receivers.size());
           const Receiver r = ReceiverOfHit(*scene_.accel, *hit, w);
           sample.depth = rays_.Depth(r.position);
+          if (glossy_ != nullptr && scene.IsGlossy(hit->triangle)) {
+            sample.glossy = static_cast<int32_t>(glossy.size());
+            glossy.emplace_back(*scene_.accel, *hit, w);
+            sample.diffuse_albedo = glossy.back().brdf().diffuse_albedo();
+          }
           receivers.push_back(r);
           sample_of.push_back(static_cast<uint32_t>(at));
         }
@@ -460,6 +489,7 @@ class Renderer final : public FrameRenderer {
       Pulse();
       if (!wanted[r]) continue;
       Sample& sample = samples[sample_of[r]];
+      if (sample.glossy >= 0 && !wants_direct_irradiance_) continue;
       if (IsBlack(sample) && !wants_direct_irradiance_ && settings_.skips(kSkipBlack)) {
         ++n.skipped_black;
         continue;
@@ -472,9 +502,35 @@ class Renderer final : public FrameRenderer {
     Add(counters, n);
   }
 
-  void TracePaths(const PixelRect& block, std::vector<Sample>& samples,
-                  const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
-                  const std::vector<uint8_t>& wanted, Counters& n) const {
+  // Glossy receivers: all their direct light, and, but for the path tracer, what their interface
+  // reflects of indirect light.
+  void ReflectGloss(const PixelRect& block, Primary& primary, Counters& n, Stats& stats) const {
+    auto& [samples, receivers, sample_of, wanted, glossy] = primary;
+    if (!scene_.lights->any_light()) return;
+    const uint32_t each = (settings_.light_samples + settings_.spp - 1) / settings_.spp;
+    const bool indirect = wants_indirect_ && settings_.integrator != Integrator::kPt;
+    LightCounters counters;
+    for (size_t r = 0; r < receivers.size(); ++r) {
+      Pulse();
+      if (!wanted[r]) continue;
+      Sample& sample = samples[sample_of[r]];
+      if (sample.glossy < 0) {
+        ++n.skipped_matte;
+        continue;
+      }
+      ++n.glossy_receivers;
+      const GlossyGatherer::Reflected reflected = glossy_->Reflect(
+          receivers[r], glossy[static_cast<size_t>(sample.glossy)],
+          HashKey(PixelKey(block, sample_of[r], kKeyGloss), sample_of[r] % settings_.spp), each,
+          wants_direct_, indirect, counters, stats);
+      sample.direct_l = reflected.direct;
+      sample.glossy_l = reflected.indirect;
+    }
+    Add(counters, n);
+  }
+
+  void TracePaths(const PixelRect& block, Primary& primary, Counters& n) const {
+    auto& [samples, receivers, sample_of, wanted, glossy] = primary;
     if (!scene_.lights->any_light() && settings_.skips(kSkipUnlit)) {
       n.skipped_unlit += receivers.size();
       return;
@@ -483,12 +539,31 @@ class Renderer final : public FrameRenderer {
     for (size_t r = 0; r < receivers.size(); ++r) {
       Pulse();
       if (!wanted[r]) continue;
+      Sample& sample = samples[sample_of[r]];
+      const uint64_t key =
+          HashKey(PixelKey(block, sample_of[r], kKeyPath), sample_of[r] % settings_.spp);
+      if (glossy_ != nullptr) {
+        if (sample.glossy >= 0) {
+          const TracedReflection traced = TraceGlossyIndirect(
+              *scene_.accel, *scene_.lights, glossy[static_cast<size_t>(sample.glossy)],
+              settings_.paths, settings_.bounces, HashKey(key, kKeyGloss), counters, n.rays,
+              NeedlessLightOf(settings_));
+          sample.diffuse_l = traced.diffuse;
+          sample.glossy_l = traced.glossy;
+          if (!wants_irradiance_) continue;
+        }
+        const TracedIrradiance traced = TraceIndirectAmongGloss(
+            *scene_.accel, *scene_.lights, receivers[r], settings_.paths, settings_.bounces, key,
+            counters, n.rays, NeedlessLightOf(settings_));
+        sample.indirect_e = traced.irradiance;
+        sample.standard_error = traced.standard_error;
+        continue;
+      }
       const TracedIrradiance traced = TraceIndirect(
-          *scene_.accel, *scene_.lights, receivers[r], settings_.paths, settings_.bounces,
-          HashKey(PixelKey(block, sample_of[r], kKeyPath), sample_of[r] % settings_.spp), counters,
-          n.rays, NeedlessLightOf(settings_), !settings_.skips(kSkipBlack));
-      samples[sample_of[r]].indirect_e = traced.irradiance;
-      samples[sample_of[r]].standard_error = traced.standard_error;
+          *scene_.accel, *scene_.lights, receivers[r], settings_.paths, settings_.bounces, key,
+          counters, n.rays, NeedlessLightOf(settings_), !settings_.skips(kSkipBlack));
+      sample.indirect_e = traced.irradiance;
+      sample.standard_error = traced.standard_error;
     }
     Add(counters, n);
   }
@@ -581,9 +656,8 @@ class Renderer final : public FrameRenderer {
         ++end;
       }
       std::stable_partition(order.begin() + static_cast<ptrdiff_t>(begin),
-                            order.begin() + static_cast<ptrdiff_t>(end), [&](uint32_t r) {
-                              return MaxComponent(samples[sample_of[r]].albedo) > 0.0f;
-                            });
+                            order.begin() + static_cast<ptrdiff_t>(end),
+                            [&](uint32_t r) { return !IsBlack(samples[sample_of[r]]); });
     }
     return order;
   }
@@ -858,7 +932,8 @@ class Renderer final : public FrameRenderer {
             (static_cast<size_t>(y - block.y0) * static_cast<size_t>(block.width()) +
              static_cast<size_t>(x - block.x0)) *
             spp;
-        Rgb direct, indirect, emission, albedo, irradiance, direct_irradiance, error;
+        Rgb direct, indirect, glossy_indirect, emission, albedo, irradiance, direct_irradiance,
+            error;
         Vec3f normal;
         Vec3d position;
         float depth = 0, cluster = 0, cut_size = 0;
@@ -871,8 +946,14 @@ class Renderer final : public FrameRenderer {
           }
           ++hits;
           const Receiver& r = receivers[sample.receiver];
-          direct += sample.albedo * sample.direct_e * kInvPif;
-          indirect += sample.albedo * sample.indirect_e * kInvPif;
+          if (sample.glossy < 0) {
+            direct += sample.albedo * sample.direct_e * kInvPif;
+            indirect += sample.albedo * sample.indirect_e * kInvPif;
+          } else {
+            direct += sample.direct_l;
+            indirect += sample.diffuse_l;
+            glossy_indirect += sample.glossy_l;
+          }
           emission += sample.emission;
           albedo += sample.albedo;
           irradiance += sample.indirect_e;
@@ -886,6 +967,9 @@ class Renderer final : public FrameRenderer {
         }
         direct *= inverse_spp;
         indirect *= inverse_spp;
+        glossy_indirect *= inverse_spp;
+        const Rgb diffuse_indirect = indirect;
+        indirect += glossy_indirect;
         emission *= inverse_spp;
         albedo *= inverse_spp;
         // Of what was hit: geometry, and irradiance, which background does not have.
@@ -946,6 +1030,12 @@ class Renderer final : public FrameRenderer {
             case Layer::kCutSize:
               set1(cut_size * inverse_hits);
               break;
+            case Layer::kDiffuseIndirect:
+              set(diffuse_indirect);
+              break;
+            case Layer::kGlossyIndirect:
+              set(glossy_indirect);
+              break;
           }
         }
       }
@@ -963,6 +1053,10 @@ class Renderer final : public FrameRenderer {
     stats.counts["exact_discs"] += n.exact_discs;
     stats.counts["cache_records"] += n.own_records;
     stats.counts["clusters_of_samples"] += n.sample_records;
+    if (n.glossy_receivers + n.skipped_matte > 0) {
+      stats.counts["glossy_receivers"] += n.glossy_receivers;
+      stats.skipped["matte_receivers"] += n.skipped_matte;
+    }
     stats.skipped["blocks_without_receivers"] += n.skipped_no_receivers;
     stats.skipped["black_receivers"] += n.skipped_black;
     stats.skipped["unlit_receivers"] += n.skipped_unlit;
@@ -986,6 +1080,7 @@ class Renderer final : public FrameRenderer {
   HemisphereGrid ray_grid_;  // of k clusters per block filled by rays
   CutParams cut_params_;
   std::unique_ptr<RecordGatherer> gatherer_;
+  std::unique_ptr<const GlossyGatherer> glossy_;          // null: no surface is glossy
   mutable std::once_flag scaled_;                         // on the first tile that needs it:
   mutable std::unique_ptr<ReceiverHierarchy> hierarchy_;  // of adaptive clusters
   mutable std::mutex cache_mutex_;
@@ -1043,8 +1138,9 @@ absl::StatusOr<std::unique_ptr<FrameRenderer>> FrameRenderer::Create(
         "a point-based integrator needs a point tree, and the scene was baked without one");
   }
   const Integrator integrator = frame.settings.integrator;
-  if ((integrator == Integrator::kFpbgi || integrator == Integrator::kIrrcache) &&
-      frame.settings.fill_in_force() == Fill::kRays) {
+  if (static_cast<const LoadedSceneData&>(*scene).scene->has_gloss() ||
+      ((integrator == Integrator::kFpbgi || integrator == Integrator::kIrrcache) &&
+       frame.settings.fill_in_force() == Fill::kRays)) {
     FP_RETURN_IF_ERROR(static_cast<const LoadedSceneData&>(*scene).accel->PrepareBundles());
   }
   return std::unique_ptr<FrameRenderer>(std::make_unique<Renderer>(std::move(scene), frame));

@@ -39,10 +39,13 @@ void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black
     const uint32_t t = hits.triangle[i];
     const PreparedTriangle& triangle = scene.triangles()[t];
     const PreparedObject& object = scene.objects()[triangle.object];
-    if (!keep_black && !(MaxComponent(scene.materials()[object.material].base_color) > 0.0f)) {
+    const PreparedMaterial& material = scene.materials()[object.material];
+    if (!keep_black && material.glossy == 0 && !(MaxComponent(material.base_color) > 0.0f)) {
       continue;
     }
-    const bool flat = object.has_normals == 0;
+    // What a normal map turns has one normal for all that is made of its corners.
+    const bool bumped = material.normal_texture >= 0;
+    const bool flat = object.has_normals == 0 && !bumped;
     const uint32_t k = kept++;
     hits.ray[k] = hits.ray[i];
     hits.index[k] = hits.index[i];
@@ -53,7 +56,11 @@ void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black
     hits.flat[k] = flat ? 1.0f : 0.0f;
     for (size_t c = 0; c < 3; ++c) {
       hits.vertex[c].Set(k, scene.vertices()[triangle.vertex[c]]);
-      hits.normal[c].Set(k, flat ? Vec3f() : scene.normals()[triangle.vertex[c]]);
+      if (!bumped) hits.normal[c].Set(k, flat ? Vec3f() : scene.normals()[triangle.vertex[c]]);
+    }
+    if (bumped) {
+      const Vec3f n = scene.ShadingNormal(t, hits.b1[i], hits.b2[i]);
+      for (RayHits::Rows& normal : hits.normal) normal.Set(k, n);
     }
   }
   hits.count = kept;

@@ -45,7 +45,8 @@ struct RayHits {
 void KeepWhatReflects(const PreparedScene& scene, RayHits& hits, bool keep_black = false);
 
 // Where hits `first` (a multiple of eight) to `first + 7` lie, with normals on the side that the
-// rays came from, to the bits of PreparedScene's functions. `active` is left to the caller.
+// rays came from, to the bits of PreparedScene's functions (of normal maps to their rounding).
+// `active` is left to the caller.
 SurfacePoints8 SurfaceAt(const RayHits& hits, size_t first);
 
 // SurfaceAt of all hits, their lanes active; returns how many groups of kHitLanes that are.

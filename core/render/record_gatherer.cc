@@ -10,14 +10,12 @@
 #include "core/math/sampling.h"
 #include "core/pbgi/cut_drawer.h"
 #include "core/pbgi/microbuffer.h"
-#include "core/render/ray_hits.h"
+#include "core/render/hit_reader.h"
 
 namespace farpoint {
 
 namespace {
 
-// Below this many surfel spacings from the receiver a hit is shaded afresh.
-constexpr float kNearSpacings = 2.0f;
 // Of a stratum, beyond its first. A multiple of eight.
 constexpr uint32_t kMostExtraRays = 32;
 // The receivers that say how bright a frame is: one for so many pixels, within bounds.
@@ -26,143 +24,6 @@ constexpr uint32_t kPilotSamples = 128;
 // Rays that bring more than so many times the mean of their record are traced again, watertight.
 constexpr float kOdd = 16.0f;
 enum : uint64_t { kKeyDirections = 31, kKeyLight = 32, kKeyPilot = 33, kKeyPilotGather = 34 };
-
-// What one receiver sees along rays.
-class HitReader {
- public:
-  HitReader(const LoadedSceneData& scene, const SurfelAtlas* atlas, const SurfelAtlas* indirect,
-            float near_m, const Receiver& receiver, uint64_t light_key)
-      : scene_(scene),
-        atlas_(atlas),
-        indirect_(indirect),
-        near_m_(near_m),
-        origin_(receiver.Leave()),
-        offset_m_(receiver.offset_m),
-        light_key_(light_key) {}
-
-  // Rays to be read together: up to kRaysTogether.
-  struct Rays {
-    uint32_t count = 0;
-    std::array<Vec3f, kRaysTogether> direction;
-    std::array<uint32_t, kRaysTogether> index;  // tells a ray from the receiver's others
-    std::array<uint32_t, kRaysTogether> stratum;
-    // Results: the reflected radiance that arrives against the direction and 1 / the distance,
-    // 0: nothing there.
-    std::array<Rgb, kRaysTogether> radiance;
-    std::array<float, kRaysTogether> inverse_distance;
-
-    void Add(const Vec3f& w, uint32_t ray_index, uint32_t of) {
-      direction[count] = w;
-      index[count] = ray_index;
-      stratum[count++] = of;
-    }
-  };
-
-  void Read(Rays& rays) {
-    std::array<RayHit, kRaysTogether> hits;
-    traced += rays.count;
-    scene_.accel->IntersectBundle(origin_, std::span(rays.direction).first(rays.count), hits);
-    Read(rays, hits);
-  }
-
-  // Again one ray that may have slipped between two triangles.
-  void ReadAgain(Rays& rays, uint32_t i) {
-    ++traced;
-    ++again;
-    std::array<RayHit, kRaysTogether> hits;
-    Rays one;
-    one.Add(rays.direction[i], rays.index[i], rays.stratum[i]);
-    const std::optional<RayHit> hit = scene_.accel->Intersect(origin_, one.direction[0]);
-    hits[0].triangle = kNoTriangle;
-    if (hit) hits[0] = *hit;
-    Read(one, hits);
-    rays.radiance[i] = one.radiance[0];
-    rays.inverse_distance[i] = one.inverse_distance[0];
-  }
-
-  LightCounters counters;
-  uint64_t traced = 0, again = 0, read = 0, shaded = 0;
-
- private:
-  void Read(Rays& rays, std::span<const RayHit> hits) {
-    // What lies far brings its surfel's radiance …
-    std::array<SurfelAtlas::Point, kRaysTogether> far;
-    std::array<uint32_t, kRaysTogether> far_ray;
-    uint32_t far_count = 0;
-    RayHits near;
-    const auto shade = [&](uint32_t i) {
-      const uint32_t k = near.count++;
-      near.ray[k] = i;
-      near.index[k] = rays.index[i];
-      near.triangle[k] = hits[i].triangle;
-      near.b1[k] = hits[i].b1;
-      near.b2[k] = hits[i].b2;
-      near.direction.Set(k, rays.direction[i]);
-    };
-    for (uint32_t i = 0; i < rays.count; ++i) {
-      rays.radiance[i] = Rgb();
-      rays.inverse_distance[i] = 0;
-      const RayHit& hit = hits[i];
-      if (hit.triangle == kNoTriangle) continue;
-      // A hit at the origin itself has no distance: as near as the offset that the ray took.
-      const float t = std::max(hit.t, offset_m_);
-      rays.inverse_distance[i] = 1.0f / t;
-      if (atlas_ != nullptr && t > near_m_) {
-        far_ray[far_count] = i;
-        far[far_count++] = {hit.triangle, hit.b1, hit.b2, hit.front};
-      } else {
-        shade(i);
-      }
-    }
-    if (far_count > 0) {
-      std::array<Rgb, kRaysTogether> radiance;
-      const uint64_t found = atlas_->Radiances(std::span(far).first(far_count), radiance);
-      for (uint32_t k = 0; k < far_count; ++k) {
-        if ((found >> k & 1) != 0) {
-          ++read;
-          rays.radiance[far_ray[k]] = radiance[k];
-        } else {
-          shade(far_ray[k]);
-        }
-      }
-    }
-    // … and the rest is shaded.
-    const PreparedScene& scene = *scene_.scene;
-    KeepWhatReflects(scene, near);
-    if (near.count == 0) return;
-    shaded += near.count;
-    std::array<SurfacePoints8, kRaysTogether / kHitLanes> points;
-    std::array<V8, kRaysTogether / kHitLanes> irradiance;
-    const size_t groups = SurfacesOf(near, points);
-    scene_.lights->IrradianceEach(std::span(points).first(groups), light_key_, 2,
-                                  std::span(irradiance).first(groups), counters);
-    std::array<Rgb, kRaysTogether> indirect;
-    uint64_t found = 0;
-    if (indirect_ != nullptr) {
-      std::array<SurfelAtlas::Point, kRaysTogether> at;
-      for (uint32_t k = 0; k < near.count; ++k) {
-        at[k] = {near.triangle[k], near.b1[k], near.b2[k], hits[near.ray[k]].front};
-      }
-      found = indirect_->Radiances(std::span(at).first(near.count), indirect);
-    }
-    for (uint32_t k = 0; k < near.count; ++k) {
-      Rgb arriving = irradiance[k / kHitLanes].Lane(k % kHitLanes);
-      if ((found >> k & 1) != 0) arriving += indirect[k];
-      // Textures are looked up where light arrives only.
-      if (!(MaxComponent(arriving) > 0.0f)) continue;
-      const Rgb albedo = scene.Surface(near.triangle[k], near.b1[k], near.b2[k]).albedo;
-      rays.radiance[near.ray[k]] = albedo * arriving * kInvPif;
-    }
-  }
-
-  const LoadedSceneData& scene_;
-  const SurfelAtlas* const atlas_;
-  const SurfelAtlas* const indirect_;
-  const float near_m_;
-  const Vec3f origin_;
-  const float offset_m_;
-  const uint64_t light_key_;
-};
 
 float Grey(const Rgb& c) { return (c.x + c.y + c.z) * (1.0f / 3); }
 float GreyAt(const HemisphereSamples& samples, size_t at) {

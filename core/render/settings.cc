@@ -19,6 +19,7 @@ constexpr std::array<std::string_view, 5> kIntegratorNames = {"fpbgi", "pbgi", "
 constexpr std::array<std::string_view, 4> kFilterNames = {"box", "triangle", "gaussian",
                                                           "blackman-harris"};
 constexpr std::array<std::string_view, 3> kFillNames = {"auto", "rays", "cut"};
+constexpr std::array<std::string_view, 2> kMaterialsNames = {"lambert", "gltf"};
 constexpr std::array<std::string_view, 3> kQualityNames = {"draft", "normal", "fine"};
 // Of irrcache, by quality: docs/decisions/0016-irradiance-cache.md has the figures.
 constexpr std::array<float, 3> kCacheErrors = {0.3f, 0.2f, 0.1f};
@@ -110,6 +111,9 @@ absl::Status ValidateSettings(const RenderSettings& s) {
   if (static_cast<uint32_t>(s.quality) >= kQualityNames.size()) {
     return absl::InvalidArgumentError("quality: unknown value; use draft, normal or fine");
   }
+  if (static_cast<uint32_t>(s.materials) >= kMaterialsNames.size()) {
+    return absl::InvalidArgumentError("materials: unknown value; use lambert or gltf");
+  }
   if (s.cache_error != 0.0f && !(s.cache_error >= 0.01f && s.cache_error <= 10.0f)) {
     return absl::InvalidArgumentError("cache-error must be 0 or between 0.01 and 10");
   }
@@ -194,5 +198,17 @@ absl::StatusOr<Quality> QualityFromName(std::string_view name) {
 }
 
 std::string_view NameOf(Quality quality) { return kQualityNames[static_cast<size_t>(quality)]; }
+
+absl::StatusOr<Materials> MaterialsFromName(std::string_view name) {
+  for (size_t i = 0; i < kMaterialsNames.size(); ++i) {
+    if (kMaterialsNames[i] == name) return static_cast<Materials>(i);
+  }
+  return absl::InvalidArgumentError("unknown materials '" + std::string(name) +
+                                    "'; use lambert or gltf");
+}
+
+std::string_view NameOf(Materials materials) {
+  return kMaterialsNames[static_cast<size_t>(materials)];
+}
 
 }  // namespace farpoint

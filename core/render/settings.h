@@ -35,6 +35,12 @@ enum class Fill : uint32_t {
 // The error that adaptive clusters aim at: how many, and how finely sampled.
 enum class Quality : uint32_t { kDraft, kNormal, kFine };
 
+// What surfaces are made of.
+enum class Materials : uint32_t {
+  kLambert,  // all Lambert, with the base colour
+  kGltf,     // glTF's metallic-roughness model, with normal maps (core/math/microfacet.h)
+};
+
 // What a frame computes only if the scene needs it (docs/skipping.md). Values of a mask.
 enum SkipMask : uint32_t {
   kSkipBlack = 1u << 0,          // receivers, surfels and hits that reflect nothing
@@ -56,8 +62,9 @@ struct RenderSettings {
   Integrator integrator = Integrator::kFpbgi;
   uint32_t spp = 1;  // receivers per pixel, 1..256; 1: the pixel's centre
   PixelFilter filter = PixelFilter::kBlackmanHarris;  // of no effect at spp 1
-  float filter_width_px = 0;    // of its whole support, 0.01..16; 0: the filter's default
-  uint32_t paths = 64;          // pt: paths per receiver, 1..2^20
+  float filter_width_px = 0;  // of its whole support, 0.01..16; 0: the filter's default
+  uint32_t paths = 64;        // pt: paths per receiver, 1..2^20
+  Materials materials = Materials::kLambert;
   uint32_t bounces = 1;         // of indirect light, 1..kMostBounces; irrcache knows one
   uint32_t light_samples = 32;  // shadow rays per receiver, see docs/lights.md, 1..4096
   uint64_t points = 0;          // surfels, 1..2^31; 0: from the scene's area and size
@@ -117,5 +124,7 @@ absl::StatusOr<Fill> FillFromName(std::string_view name);
 std::string_view NameOf(Fill fill);
 absl::StatusOr<Quality> QualityFromName(std::string_view name);
 std::string_view NameOf(Quality quality);
+absl::StatusOr<Materials> MaterialsFromName(std::string_view name);
+std::string_view NameOf(Materials materials);
 
 }  // namespace farpoint

@@ -37,12 +37,12 @@ class FolderSource : public AssetSource {
 
 // Reads all that the main file refers to.
 absl::Status ReadReferences(const std::string& path, const std::string& root, const Blob& file,
-                            AssetSource& source) {
+                            bool gloss, AssetSource& source) {
   FP_ASSIGN_OR_RETURN(const SceneFormat format, SceneFormatOf(root));
   switch (format) {
     case SceneFormat::kGltf: {
       FP_ASSIGN_OR_RETURN(const GltfContainer container, OpenGltfContainer(root, file));
-      FP_ASSIGN_OR_RETURN(const auto references, ListGltfReferences(root, container));
+      FP_ASSIGN_OR_RETURN(const auto references, ListGltfReferences(root, container, gloss));
       for (const GltfReference& reference : references) {
         const auto blob = source.Read(reference.uri);
         if (blob.ok()) continue;
@@ -69,7 +69,7 @@ absl::StatusOr<Blob> AssetBundle::Find(const std::string& uri) const {
                              "' refers to, is missing; put it beside '" + root + "'");
 }
 
-absl::StatusOr<AssetBundle> CollectAsset(const std::string& path) {
+absl::StatusOr<AssetBundle> CollectAsset(const std::string& path, bool gloss) {
   const std::filesystem::path main_path(path);
   AssetBundle bundle;
   bundle.root = main_path.filename().string();
@@ -77,7 +77,7 @@ absl::StatusOr<AssetBundle> CollectAsset(const std::string& path) {
   FP_ASSIGN_OR_RETURN(const Blob main_file, ReadFile(path));
   bundle.files.emplace(bundle.root, main_file);
   FolderSource source(main_path.parent_path(), bundle.files);
-  FP_RETURN_IF_ERROR(ReadReferences(path, bundle.root, main_file, source));
+  FP_RETURN_IF_ERROR(ReadReferences(path, bundle.root, main_file, gloss, source));
   return bundle;
 }
 

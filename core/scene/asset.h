@@ -19,10 +19,11 @@ struct AssetBundle {
 };
 
 // Reads the main file at `path` and the files that it needs, each relative to its folder: glTF's
-// buffers and the images of base colours and emission; OBJ's material libraries and the images of
+// buffers and the images of base colours and emission, with `gloss` also those of metal, roughness
+// and normals; OBJ's material libraries and the images of
 // the materials that it uses. kNotFound names the missing file and who refers to it;
 // kInvalidArgument for an unknown extension (names those known), for URIs with a scheme other than
 // data:, and for malformed JSON and MTL with the line.
-absl::StatusOr<AssetBundle> CollectAsset(const std::string& path);
+absl::StatusOr<AssetBundle> CollectAsset(const std::string& path, bool gloss = false);
 
 }  // namespace farpoint

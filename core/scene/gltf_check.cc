@@ -732,6 +732,9 @@ class Checker {
     FP_RETURN_IF_ERROR(CheckNumbers(place, "emissiveFactor", 3, 0, 1e12));
     FP_RETURN_IF_ERROR(CheckTextureInfo(place, "emissiveTexture"));
     FP_RETURN_IF_ERROR(CheckTextureInfo(place, "normalTexture"));
+    FP_RETURN_IF_ERROR(WithObject(place, "normalTexture", [&](const Place& normal) {
+      return CheckNumber(normal, "scale", -1e6, 1e6);
+    }));
     FP_RETURN_IF_ERROR(CheckTextureInfo(place, "occlusionTexture"));
     FP_RETURN_IF_ERROR(CheckNumber(place, "alphaCutoff", 0, 1e6));
     FP_RETURN_IF_ERROR(CheckBoolean(place, "doubleSided"));
@@ -748,6 +751,9 @@ class Checker {
             FP_RETURN_IF_ERROR(CheckNumbers(pbr, "diffuseFactor", 4, 0, 1e6));
             return CheckTextureInfo(pbr, "diffuseTexture");
           }));
+      FP_RETURN_IF_ERROR(WithObject(extensions, "KHR_materials_ior", [&](const Place& ior) {
+        return CheckNumber(ior, "ior", 0, 1e6);
+      }));
       return WithObject(extensions, "KHR_materials_emissive_strength", [&](const Place& strength) {
         return CheckNumber(strength, "emissiveStrength", 0, 1e12);
       });
@@ -1134,7 +1140,7 @@ void AddImageOf(const Json& root, const Json& holder, const char* key, std::set<
   if (object["source"].is_number_unsigned()) images.insert(object["source"].get<size_t>());
 }
 
-std::set<size_t> UsedImages(const Json& root) {
+std::set<size_t> UsedImages(const Json& root, bool gloss) {
   std::set<size_t> images;
   for (size_t i = 0; i < ArraySize(root, "materials"); ++i) {
     const Json& material = root["materials"][i];
@@ -1143,7 +1149,9 @@ std::set<size_t> UsedImages(const Json& root) {
     const auto pbr = material.find("pbrMetallicRoughness");
     if (pbr != material.end() && pbr->is_object()) {
       AddImageOf(root, *pbr, "baseColorTexture", images);
+      if (gloss) AddImageOf(root, *pbr, "metallicRoughnessTexture", images);
     }
+    if (gloss) AddImageOf(root, material, "normalTexture", images);
     const auto extensions = material.find("extensions");
     if (extensions == material.end() || !extensions->is_object()) continue;
     const auto glossiness = extensions->find("KHR_materials_pbrSpecularGlossiness");
@@ -1243,11 +1251,12 @@ absl::StatusOr<GltfContainer> OpenGltfContainer(const std::string& name, const B
 }
 
 absl::StatusOr<std::vector<GltfReference>> ListGltfReferences(const std::string& name,
-                                                              const GltfContainer& container) {
+                                                              const GltfContainer& container,
+                                                              bool gloss) {
   FP_ASSIGN_OR_RETURN(const Json json, ParseJson(name, container.json));
   std::vector<GltfReference> references;
   const Place root(name, json);
-  const std::set<size_t> used_images = UsedImages(json);
+  const std::set<size_t> used_images = UsedImages(json, gloss);
   for (const char* key : {"buffers", "images"}) {
     size_t index = 0;
     FP_RETURN_IF_ERROR(ForEachObject(root, key, [&](const Place& place) -> absl::Status {

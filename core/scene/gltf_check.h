@@ -33,10 +33,12 @@ struct GltfReference {
 };
 
 // The external files that are needed: all buffers, and the images that a base colour or emission
-// uses. kInvalidArgument for malformed JSON (line, column) and for URIs that are absolute, leave
-// the scene's folder or have a scheme other than data:.
+// uses, with `gloss` also those of metal, roughness and normals. kInvalidArgument for malformed
+// JSON (line, column) and for URIs that are absolute, leave the scene's folder or have a scheme
+// other than data:.
 absl::StatusOr<std::vector<GltfReference>> ListGltfReferences(const std::string& name,
-                                                              const GltfContainer& container);
+                                                              const GltfContainer& container,
+                                                              bool gloss = false);
 
 // A buffer in a file of its own: its URI as it is written, and how many of its bytes count.
 struct GltfBufferFile {

@@ -28,7 +28,7 @@ constexpr double kLumensPerWatt = 683.0;
 
 constexpr const char* kSpecularGlossiness = "KHR_materials_pbrSpecularGlossiness";
 
-// Extensions that only concern what a Lambert surface does not show, or nothing that is rendered.
+// Extensions that are read, that only concern what is not shown, or nothing that is rendered.
 const char* const kHarmlessExtensions[] = {"KHR_lights_punctual",
                                            "KHR_materials_emissive_strength",
                                            "KHR_texture_transform",
@@ -184,6 +184,15 @@ TextureInfo InfoOf(const tinygltf::TextureInfo& info) {
   return {info.index, info.texCoord, FindExtension(info.extensions, "KHR_texture_transform")};
 }
 
+// Of an interface between air and what refracts by `ior`, seen straight on (KHR_materials_ior; its
+// 0 stands for infinity).
+float ReflectanceOf(double ior) {
+  constexpr double kMost = 0.99;
+  if (!(ior >= 1)) return ior == 0 ? static_cast<float>(kMost) : 0.0f;
+  const double root = (ior - 1) / (ior + 1);
+  return static_cast<float>(std::min(root * root, kMost));
+}
+
 TextureInfo InfoOf(const tinygltf::Value& holder, const char* key) {
   TextureInfo info;
   if (!holder.Has(key) || !holder.Get(key).IsObject()) return info;
@@ -325,6 +334,10 @@ class Importer {
     for (const auto& material : model_.materials) {
       used.insert(material.pbrMetallicRoughness.baseColorTexture.index);
       used.insert(material.emissiveTexture.index);
+      if (options_.gloss) {
+        used.insert(material.pbrMetallicRoughness.metallicRoughnessTexture.index);
+        used.insert(material.normalTexture.index);
+      }
       if (const auto* e = FindExtension(material.extensions, kSpecularGlossiness)) {
         used.insert(InfoOf(*e, "diffuseTexture").index);
       }
@@ -404,6 +417,9 @@ class Importer {
       std::vector<double> factor = pbr.baseColorFactor;
       TextureInfo texture = InfoOf(pbr.baseColorTexture);
       std::string texture_place = place + "/pbrMetallicRoughness/baseColorTexture";
+      material.metallic = static_cast<float>(pbr.metallicFactor);
+      material.roughness = static_cast<float>(pbr.roughnessFactor);
+      bool metal_roughness = true;
       // Its diffuse colour is what a Lambert surface shows; the metallic variant is a stand-in.
       if (const auto* e = FindExtension(source.extensions, kSpecularGlossiness)) {
         factor = {1, 1, 1, 1};
@@ -414,6 +430,9 @@ class Importer {
         }
         texture = InfoOf(*e, "diffuseTexture");
         texture_place = place + "/extensions/" + kSpecularGlossiness + "/diffuseTexture";
+        metal_roughness = false;
+        material.metallic = 0;
+        material.roughness = 1;
       }
       if (factor.size() == 4) {
         bool above_one = false;
@@ -426,8 +445,22 @@ class Importer {
         material.base_alpha = static_cast<float>(std::min(factor[3], 1.0));
       }
       material.base_color_texture = ImportTextureRef(texture, texture_place);
-      material.metallic = static_cast<float>(pbr.metallicFactor);
-      material.roughness = static_cast<float>(pbr.roughnessFactor);
+      if (const auto* e = FindExtension(source.extensions, "KHR_materials_ior")) {
+        material.dielectric_f0 = ReflectanceOf(NumberOr(*e, "ior", 1.5));
+      }
+      if (options_.gloss) {
+        if (metal_roughness) {
+          material.metal_roughness_texture =
+              ImportTextureRef(InfoOf(pbr.metallicRoughnessTexture),
+                               place + "/pbrMetallicRoughness/metallicRoughnessTexture");
+        }
+        const auto& normal = source.normalTexture;
+        material.normal_texture =
+            ImportTextureRef({normal.index, normal.texCoord,
+                              FindExtension(normal.extensions, "KHR_texture_transform")},
+                             place + "/normalTexture");
+        material.normal_scale = static_cast<float>(normal.scale);
+      }
       if (source.alphaMode == "MASK") {
         material.alpha_mode = AlphaMode::kMask;
         material.alpha_cutoff = static_cast<float>(source.alphaCutoff);
@@ -689,7 +722,8 @@ class Importer {
 
   void NoteMissingUvs(const Mesh& mesh, const std::string& place) {
     const Material& material = scene_.materials[static_cast<size_t>(mesh.material)];
-    for (const TextureRef* ref : {&material.base_color_texture, &material.emission_texture}) {
+    for (const TextureRef* ref : {&material.base_color_texture, &material.emission_texture,
+                                  &material.metal_roughness_texture, &material.normal_texture}) {
       if (ref->present() && mesh.uv[ref->uv_set].empty()) {
         Note(place + " has no TEXCOORD_" + std::to_string(ref->uv_set) +
              ", which the texture of '" + material.name + "' needs; its texel at (0, 0) is used");

@@ -199,10 +199,17 @@ class Writer {
       if (m.base_color_texture.present()) {
         pbr["baseColorTexture"] = TextureInfo(m.base_color_texture);
       }
+      if (m.metal_roughness_texture.present()) {
+        pbr["metallicRoughnessTexture"] = TextureInfo(m.metal_roughness_texture);
+      }
       Json material = {{"name", m.name}, {"doubleSided", true}, {"pbrMetallicRoughness", pbr}};
       if (m.alpha_mode == AlphaMode::kMask) {
         material["alphaMode"] = "MASK";
         material["alphaCutoff"] = m.alpha_cutoff;
+      }
+      if (m.normal_texture.present()) {
+        material["normalTexture"] = TextureInfo(m.normal_texture);
+        material["normalTexture"]["scale"] = m.normal_scale;
       }
       const double strength = MaxComponent(m.emission);
       if (strength > 0) {

@@ -108,4 +108,15 @@ void EnsureCameraAndLight(ImportedScene& imported, bool light_chosen) {
   }
 }
 
+void NoteHiddenGloss(ImportedScene& imported) {
+  const auto glossy =
+      std::count_if(imported.scene.materials.begin(), imported.scene.materials.end(),
+                    [](const Material& m) { return m.metallic > 0 || m.roughness < 1; });
+  if (glossy == 0) return;
+  imported.notes.push_back(std::to_string(glossy) +
+                           (glossy == 1 ? " material is" : " materials are") +
+                           " metallic or glossy and shown as Lambert with the base colour; "
+                           "--materials gltf shows gloss");
+}
+
 }  // namespace farpoint

@@ -22,6 +22,8 @@ struct ImportOptions {
   // Nothing: the rest pose. Else all animations of the file, played together, each at this time or
   // at the end of its keyframes that is nearest.
   std::optional<double> time_s;
+  // Reads also the textures that only gloss needs: of metal and roughness, and normal maps.
+  bool gloss = false;
 };
 
 // Of keyframes, in seconds; begin_s <= end_s.
@@ -55,5 +57,9 @@ absl::StatusOr<std::optional<TimeRange>> FindAnimation(const AssetBundle& asset)
 // (punctual, emissive, sky, map) a sun and a sky; a note for each. `light_chosen`: the user chose
 // the light, and what is dark stays dark. A scene without triangles gets a note, too.
 void EnsureCameraAndLight(ImportedScene& imported, bool light_chosen);
+
+// Notes that materials of the scene are metallic or glossy, which is not shown. What only textures
+// say is not looked at.
+void NoteHiddenGloss(ImportedScene& imported);
 
 }  // namespace farpoint

@@ -20,7 +20,7 @@ namespace farpoint {
 namespace {
 
 constexpr uint64_t kMagic = 0x454e454353504600;  // "\0FPSCENE"
-constexpr uint32_t kVersion = 2;
+constexpr uint32_t kVersion = 3;
 
 // Squares of lengths up to 2^62 are floats, and so are areas down to 2^-120.
 constexpr double kMaxExtentM = 0x1p60;
@@ -70,7 +70,7 @@ constexpr uint64_t kMaxElements = std::numeric_limits<uint32_t>::max();
 constexpr size_t kPiece = 1 << 14;
 
 static_assert(sizeof(PreparedTriangle) == 16 && sizeof(PreparedObject) == 32 &&
-              sizeof(PreparedMaterial) == 96 && sizeof(PreparedTexture) == 32 &&
+              sizeof(PreparedMaterial) == 184 && sizeof(PreparedTexture) == 32 &&
               sizeof(PreparedLight) == 56);
 
 // --- Looking up textures ---
@@ -227,6 +227,9 @@ bool IsHalf(float f) { return HalfToFloat(FloatToHalf(f)) == f; }
 bool UsesTexture(const PreparedMaterial& m) {
   return m.base_color_texture >= 0 || m.emission_texture >= 0;
 }
+
+// Of a normal with the surface: less would let its light come from below.
+constexpr float kLeastBumpCosine = 0.02f;
 
 absl::Status BadBlob(const std::string& text) {
   return absl::DataLossError("prepared scene: " + text +
@@ -414,8 +417,11 @@ class Builder {
     m.alpha_cutoff = mask ? source.alpha_cutoff : -1.0f;
     m.emission = source.emission;
     m.base_color_texture = m.emission_texture = -1;
+    m.metal_roughness_texture = m.normal_texture = -1;
     MakeUvMatrix({}, m.base_color_uv);
     MakeUvMatrix({}, m.emission_uv);
+    MakeUvMatrix({}, m.metal_roughness_uv);
+    MakeUvMatrix({}, m.normal_uv);
     // A texture that is multiplied by black is not looked up.
     if (mask || MaxComponent(m.base_color) > 0) {
       FP_RETURN_IF_ERROR(AddTexture(source.base_color_texture, fail, m.base_color_texture,
@@ -425,8 +431,33 @@ class Builder {
       FP_RETURN_IF_ERROR(AddTexture(source.emission_texture, fail, m.emission_texture,
                                     m.emission_uv_set, m.emission_uv));
     }
+    if (options_.gloss) FP_RETURN_IF_ERROR(AddGloss(source, fail, m));
     materials_.push_back(m);
     return absl::OkStatus();
+  }
+
+  template <typename Fail>
+  absl::Status AddGloss(const Material& source, const Fail& fail, PreparedMaterial& m) {
+    const auto is_share = [](float x) { return x >= 0 && x <= 1; };
+    if (!is_share(source.metallic) || !is_share(source.roughness)) {
+      return fail("metallic or roughness outside of [0, 1]; clamp it");
+    }
+    if (!(source.dielectric_f0 >= 0 && source.dielectric_f0 < 1)) {
+      return fail("reflectance at normal incidence outside of [0, 1); correct it");
+    }
+    if (!(std::fabs(source.normal_scale) <= kMaxUvFactor)) {
+      return fail("normal scale beyond 1e10; correct it");
+    }
+    if (source.metallic > 0 || source.roughness < 1) {
+      m.glossy = 1;
+      m.metallic = source.metallic;
+      m.roughness = source.roughness;
+      m.dielectric_f0 = source.dielectric_f0;
+      FP_RETURN_IF_ERROR(AddTexture(source.metal_roughness_texture, fail, m.metal_roughness_texture,
+                                    m.metal_roughness_uv_set, m.metal_roughness_uv));
+    }
+    m.normal_scale = source.normal_scale;
+    return AddTexture(source.normal_texture, fail, m.normal_texture, m.normal_uv_set, m.normal_uv);
   }
 
   // Rows of uv' = offset + R(-rotation) scale uv. The extension's text and its conformance model
@@ -915,7 +946,9 @@ absl::Status PreparedScene::CheckTables() const {
                 material.alpha_cutoff >= -1 && material.alpha_cutoff <= 1e6f;
     for (int i = 0; i < 6; ++i) {
       good = good && std::fabs(material.base_color_uv[i]) <= kMaxUvFactor &&
-             std::fabs(material.emission_uv[i]) <= kMaxUvFactor;
+             std::fabs(material.emission_uv[i]) <= kMaxUvFactor &&
+             std::fabs(material.metal_roughness_uv[i]) <= kMaxUvFactor &&
+             std::fabs(material.normal_uv[i]) <= kMaxUvFactor;
     }
     const auto texture_is_good = [&](int32_t texture, uint32_t uv_set) {
       if (texture == -1) return uv_set <= 1;
@@ -923,7 +956,12 @@ absl::Status PreparedScene::CheckTables() const {
              uv_[uv_set].size() == vertices_.size();
     };
     good = good && texture_is_good(material.base_color_texture, material.base_color_uv_set) &&
-           texture_is_good(material.emission_texture, material.emission_uv_set);
+           texture_is_good(material.emission_texture, material.emission_uv_set) &&
+           texture_is_good(material.metal_roughness_texture, material.metal_roughness_uv_set) &&
+           texture_is_good(material.normal_texture, material.normal_uv_set);
+    good = good && material.glossy <= 1 && material.metallic >= 0 && material.metallic <= 1 &&
+           material.roughness >= 0 && material.roughness <= 1 && material.dielectric_f0 >= 0 &&
+           material.dielectric_f0 < 1 && std::fabs(material.normal_scale) <= kMaxUvFactor;
     if (!good) return BadBlob("material " + std::to_string(m) + " has a value out of range");
   }
   for (size_t l = 0; l < lights_.size(); ++l) {
@@ -966,6 +1004,8 @@ absl::Status PreparedScene::CheckGeometry() {
     const PreparedMaterial& material = materials_[object.material];
     const bool emits = MaxComponent(material.emission) > 0;
     has_alpha_masks_ = has_alpha_masks_ || material.alpha_cutoff >= 0;
+    has_gloss_ = has_gloss_ || material.glossy != 0;
+    has_normal_maps_ = has_normal_maps_ || material.normal_texture >= 0;
     for (uint64_t t = object.first_triangle; t < next; ++t) {
       const PreparedTriangle& triangle = triangles_[t];
       bool good = triangle.object == o;
@@ -1009,11 +1049,74 @@ Vec3f PreparedScene::PointOn(uint32_t triangle, float b1, float b2) const {
 Vec3f PreparedScene::ShadingNormal(uint32_t triangle, float b1, float b2,
                                    const Vec3f& n_geometric) const {
   const PreparedTriangle& t = triangles_[triangle];
-  if (objects_[t.object].has_normals == 0) return n_geometric;
+  const bool bumped = has_normal_maps_ && MaterialOf(triangle).normal_texture >= 0;
+  if (objects_[t.object].has_normals == 0) {
+    return bumped ? Bumped(triangle, b1, b2, n_geometric, n_geometric) : n_geometric;
+  }
   const Vec3f sum = normals_[t.vertex[0]] * (1.0f - b1 - b2) + normals_[t.vertex[1]] * b1 +
                     normals_[t.vertex[2]] * b2;
   const Vec3f n = NormalizeOr(sum, n_geometric);
-  return Dot(n, n_geometric) < 0 ? -n : n;
+  const Vec3f towards = Dot(n, n_geometric) < 0 ? -n : n;
+  return bumped ? Bumped(triangle, b1, b2, towards, n_geometric) : towards;
+}
+
+Vec3f PreparedScene::Bumped(uint32_t triangle, float b1, float b2, const Vec3f& n,
+                            const Vec3f& ng) const {
+  const PreparedMaterial& m = MaterialOf(triangle);
+  const auto& v = triangles_[triangle].vertex;
+  const auto uv = CornerUvs(triangle, m.normal_uv_set, m.normal_uv);
+  const Vec3d e1 = Vec3d(vertices_[v[1]]) - Vec3d(vertices_[v[0]]);
+  const Vec3d e2 = Vec3d(vertices_[v[2]]) - Vec3d(vertices_[v[0]]);
+  const double u1 = double{uv[1].x} - double{uv[0].x}, v1 = double{uv[1].y} - double{uv[0].y};
+  const double u2 = double{uv[2].x} - double{uv[0].x}, v2 = double{uv[2].y} - double{uv[0].y};
+  const double determinant = u1 * v2 - u2 * v1;
+  if (!(std::fabs(determinant) > 0)) return n;
+  // dP/du and dP/dv, but for a positive factor.
+  const double sign = determinant > 0 ? 1 : -1;
+  const Vec3d along_u = (e1 * v2 - e2 * v1) * sign, along_v = (e2 * u1 - e1 * u2) * sign;
+  const Vec3d z(n);
+  const Vec3d x = NormalizeOr(along_u - z * Dot(z, along_u), Vec3d());
+  if (x == Vec3d()) return n;
+  Vec3d y = Cross(z, x);
+  if (Dot(y, along_v) > 0) y = -y;
+  const Rgb texel = SampleLinear(m.normal_texture,
+                                 TransformUv(m.normal_uv, UvAt(triangle, b1, b2, m.normal_uv_set)));
+  const double scale = double{m.normal_scale};
+  const Vec3d local{(2 * double{texel.x} - 1) * scale, (2 * double{texel.y} - 1) * scale,
+                    2 * double{texel.z} - 1};
+  const Vec3f turned(NormalizeOr(x * local.x + y * local.y + z * local.z, z));
+  const float cosine = Dot(turned, ng);
+  if (cosine >= kLeastBumpCosine) return turned;
+  return NormalizeOr(turned + ng * (kLeastBumpCosine - cosine), ng);
+}
+
+Vec2f PreparedScene::UvAt(uint32_t triangle, float b1, float b2, uint32_t set) const {
+  const auto& vertex = triangles_[triangle].vertex;
+  const auto& uv = uv_[set];
+  const Vec2f &a = uv[vertex[0]], &b = uv[vertex[1]], &c = uv[vertex[2]];
+  return {a.x + (b.x - a.x) * b1 + (c.x - a.x) * b2, a.y + (b.y - a.y) * b1 + (c.y - a.y) * b2};
+}
+
+Rgb PreparedScene::SampleLinear(int32_t texture, const Vec2f& uv) const {
+  const PreparedTexture& t = textures_[static_cast<size_t>(texture)];
+  const uint32_t* texels = texels_.data() + t.first_texel;
+  const auto wrap_s = static_cast<WrapMode>(t.wrap_s);
+  const auto wrap_t = static_cast<WrapMode>(t.wrap_t);
+  const auto value = [&](uint32_t x, uint32_t y) {
+    const uint32_t texel = texels[size_t{y} * t.width + x];
+    return Rgb(static_cast<float>(texel & 255), static_cast<float>(texel >> 8 & 255),
+               static_cast<float>(texel >> 16 & 255)) *
+           (1.0f / 255);
+  };
+  if (t.nearest != 0) {
+    return value(NearestTexel(uv.x, t.width, wrap_s), NearestTexel(uv.y, t.height, wrap_t));
+  }
+  const Tap x = LinearTap(uv.x, t.width, wrap_s), y = LinearTap(uv.y, t.height, wrap_t);
+  const Rgb upper =
+      value(x.first, y.first) * (1.0f - x.weight) + value(x.second, y.first) * x.weight;
+  const Rgb lower =
+      value(x.first, y.second) * (1.0f - x.weight) + value(x.second, y.second) * x.weight;
+  return upper * (1.0f - y.weight) + lower * y.weight;
 }
 
 Rgb PreparedScene::SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const {
@@ -1042,16 +1145,12 @@ Rgb PreparedScene::SampleTexture(int32_t texture, const Vec2f& uv, float* alpha)
          LinearColor(texel[2]) * weight[2] + LinearColor(texel[3]) * weight[3];
 }
 
-SurfaceSample PreparedScene::Surface(uint32_t triangle, float b1, float b2) const {
+SurfaceSample PreparedScene::BaseSurface(uint32_t triangle, float b1, float b2) const {
   const PreparedTriangle& t = triangles_[triangle];
   const PreparedMaterial& m = materials_[objects_[t.object].material];
   SurfaceSample sample{m.base_color, m.emission, m.alpha_cutoff < 0 ? 1.0f : m.base_alpha};
   if (!UsesTexture(m)) return sample;
-  const auto uv_at = [&](uint32_t set) -> Vec2f {
-    const auto& uv = uv_[set];
-    const Vec2f &a = uv[t.vertex[0]], &b = uv[t.vertex[1]], &c = uv[t.vertex[2]];
-    return {a.x + (b.x - a.x) * b1 + (c.x - a.x) * b2, a.y + (b.y - a.y) * b1 + (c.y - a.y) * b2};
-  };
+  const auto uv_at = [&](uint32_t set) { return UvAt(triangle, b1, b2, set); };
   if (m.base_color_texture >= 0) {
     float alpha = 1;
     const Vec2f uv = TransformUv(m.base_color_uv, uv_at(m.base_color_uv_set));
@@ -1065,6 +1164,30 @@ SurfaceSample PreparedScene::Surface(uint32_t triangle, float b1, float b2) cons
     sample.emission = m.emission * SampleTexture(m.emission_texture, uv, nullptr);
   }
   return sample;
+}
+
+SurfaceSample PreparedScene::Surface(uint32_t triangle, float b1, float b2) const {
+  SurfaceSample sample = BaseSurface(triangle, b1, b2);
+  if (IsGlossy(triangle)) sample.albedo = MeanReflectance(Glossy(triangle, b1, b2, sample.albedo));
+  return sample;
+}
+
+MicrofacetMaterial PreparedScene::MicrofacetAt(uint32_t triangle, float b1, float b2) const {
+  return Glossy(triangle, b1, b2, BaseSurface(triangle, b1, b2).albedo);
+}
+
+MicrofacetMaterial PreparedScene::Glossy(uint32_t triangle, float b1, float b2,
+                                         const Rgb& base_color) const {
+  const PreparedMaterial& m = MaterialOf(triangle);
+  MicrofacetMaterial out{base_color, m.metallic, m.roughness, m.dielectric_f0};
+  if (m.metal_roughness_texture >= 0) {
+    const Rgb texel = SampleLinear(
+        m.metal_roughness_texture,
+        TransformUv(m.metal_roughness_uv, UvAt(triangle, b1, b2, m.metal_roughness_uv_set)));
+    out.roughness = std::min(m.roughness * texel.y, 1.0f);
+    out.metallic = std::min(m.metallic * texel.z, 1.0f);
+  }
+  return out;
 }
 
 std::array<Vec2f, 3> PreparedScene::CornerUvs(uint32_t triangle, uint32_t set,
@@ -1185,7 +1308,7 @@ Rgb PreparedScene::EnvironmentRadiance(const Vec3f& w) const {
 
 float PreparedScene::Alpha(uint32_t triangle, float b1, float b2) const {
   if (MaterialOf(triangle).alpha_cutoff < 0) return 1.0f;
-  return Surface(triangle, b1, b2).alpha;
+  return BaseSurface(triangle, b1, b2).alpha;
 }
 
 }  // namespace farpoint

@@ -20,6 +20,7 @@
 #include "core/base/executor.h"
 #include "core/base/status.h"
 #include "core/math/half.h"
+#include "core/math/microfacet.h"
 #include "core/scene/scene.h"
 
 namespace farpoint {
@@ -51,6 +52,16 @@ struct PreparedMaterial {
   uint32_t base_color_uv_set, emission_uv_set;
   float base_color_uv[6];  // rows of the 2x3 matrix on (u, v, 1)
   float emission_uv[6];
+  // 1: core/math/microfacet.h; 0: Lambert, what follows up to the normal texture is 0.
+  uint32_t glossy;
+  float metallic, roughness, dielectric_f0;
+  int32_t metal_roughness_texture;  // -1: none
+  int32_t normal_texture;
+  uint32_t metal_roughness_uv_set, normal_uv_set;
+  float metal_roughness_uv[6];
+  float normal_uv[6];
+  float normal_scale;
+  uint32_t reserved;
 };
 
 struct PreparedTexture {
@@ -73,7 +84,7 @@ struct PreparedLight {
 
 // Alpha and emission aside, what a shading point needs.
 struct SurfaceSample {
-  Rgb albedo;    // linear
+  Rgb albedo;    // linear; what is glossy: MeanReflectance
   Rgb emission;  // radiance
   float alpha;   // 1 unless the material is a mask
 };
@@ -81,6 +92,8 @@ struct SurfaceSample {
 struct PrepareOptions {
   // Decodes also the textures that no surface shows, and drops them: the same blob.
   bool all_textures = false;
+  // Materials are glTF's metallic-roughness model, with normal maps. Else all are Lambert.
+  bool gloss = false;
 };
 
 class PreparedScene {
@@ -134,6 +147,7 @@ class PreparedScene {
   Rgb EnvironmentRadiance(const Vec3f& w) const;
   // Objects are two-sided; a scene is lit if it has a light with power, an emitter, a sky or a map.
   bool has_alpha_masks() const { return has_alpha_masks_; }
+  bool has_gloss() const { return has_gloss_; }  // a surface is glossy
   // Triangles that Prepare left out because they are degenerate.
   uint64_t dropped_triangles() const { return dropped_triangles_; }
   // Textures of the Scene that Prepare did not decode, because no surface shows them or because
@@ -154,8 +168,12 @@ class PreparedScene {
   float TriangleArea(uint32_t triangle) const;
   // b1, b2: barycentric weights of vertices 1 and 2.
   Vec3f PointOn(uint32_t triangle, float b1, float b2) const;
+  bool IsGlossy(uint32_t triangle) const { return has_gloss_ && MaterialOf(triangle).glossy != 0; }
   // Interpolated and normalised, on the side of the geometric normal; the geometric normal where
-  // the mesh has none.
+  // the mesh has none. Then turned by the material's normal map: its x is the direction in which
+  // the texture's u grows on the triangle, its y that in which v falls, both made orthogonal to the
+  // normal (so mirrored coordinates mirror the relief); left alone where the coordinates are
+  // degenerate, and never turned below the surface.
   Vec3f ShadingNormal(uint32_t triangle, float b1, float b2) const {
     return ShadingNormal(triangle, b1, b2, GeometricNormal(triangle));
   }
@@ -164,6 +182,8 @@ class PreparedScene {
   // Textures are looked up bilinearly (or nearest where the file says so), in linear light, on
   // their finest level.
   SurfaceSample Surface(uint32_t triangle, float b1, float b2) const;
+  // Precondition: IsGlossy(triangle).
+  MicrofacetMaterial MicrofacetAt(uint32_t triangle, float b1, float b2) const;
   float Alpha(uint32_t triangle, float b1, float b2) const;
   // The emission averaged over the triangle, holes being black: exact if it has no texture, else
   // the mean of up to 2,080 points. (0, 0, 0) only if all of the triangle is black.
@@ -177,6 +197,13 @@ class PreparedScene {
   absl::Status CheckTables() const;
   absl::Status CheckGeometry();
   Rgb SampleTexture(int32_t texture, const Vec2f& uv, float* alpha) const;
+  // Without alpha, and as it stands: no sRGB.
+  Rgb SampleLinear(int32_t texture, const Vec2f& uv) const;
+  Vec2f UvAt(uint32_t triangle, float b1, float b2, uint32_t set) const;
+  // As if Lambert.
+  SurfaceSample BaseSurface(uint32_t triangle, float b1, float b2) const;
+  MicrofacetMaterial Glossy(uint32_t triangle, float b1, float b2, const Rgb& base_color) const;
+  Vec3f Bumped(uint32_t triangle, float b1, float b2, const Vec3f& n, const Vec3f& ng) const;
   std::array<Vec2f, 3> CornerUvs(uint32_t triangle, uint32_t set, const float (&m)[6]) const;
   bool IsBlack(int32_t texture, const std::array<Vec2f, 3>& corner) const;
 
@@ -200,6 +227,7 @@ class PreparedScene {
   std::span<const uint16_t> map_halves_;  // RGB by texel; one of the two is empty
   std::span<const float> map_floats_;
   bool has_alpha_masks_ = false;
+  bool has_gloss_ = false, has_normal_maps_ = false;
   uint64_t dropped_triangles_ = 0;
   uint64_t skipped_textures_ = 0;
 };

@@ -68,6 +68,31 @@ std::vector<CornellObject> CornellObjects() {
   };
 }
 
+// 64 slices between the poles and 128 about them.
+Mesh MeshOfSphere(const char* name, int32_t material, const Vec3f& center, float radius) {
+  constexpr uint32_t kSlices = 64, kAround = 128;
+  Mesh mesh;
+  mesh.name = name;
+  mesh.material = material;
+  for (uint32_t j = 0; j <= kSlices; ++j) {
+    const SinCos theta = DetSinCos(kPi * j / kSlices);
+    for (uint32_t i = 0; i <= kAround; ++i) {
+      const SinCos phi = DetSinCos(2 * kPi * (i % kAround) / kAround);
+      const Vec3f n(Vec3d(theta.sin * phi.cos, theta.cos, theta.sin * phi.sin));
+      mesh.positions.push_back(center + n * radius);
+      mesh.normals.push_back(n);
+    }
+  }
+  for (uint32_t j = 0; j < kSlices; ++j) {
+    for (uint32_t i = 0; i < kAround; ++i) {
+      const uint32_t a = j * (kAround + 1) + i, b = a + kAround + 1;
+      if (j > 0) mesh.triangles.push_back({a, a + 1, b + 1});
+      if (j + 1 < kSlices) mesh.triangles.push_back({a, b + 1, b});
+    }
+  }
+  return mesh;
+}
+
 }  // namespace
 
 Scene MakeCornellBox() {
@@ -89,6 +114,29 @@ Scene MakeCornellBox() {
   // A film of 25 mm behind a lens of 35 mm, square: the same angle across and up.
   camera.yfov_rad = 39.307654 * kPi / 180;
   scene.cameras.push_back(camera);
+  return scene;
+}
+
+Scene MakeGlossyCornellBox(float roughness) {
+  Scene scene = MakeCornellBox();
+  scene.name = "glossy cornell";
+  Material copper = LambertMaterial("copper", {0.955f, 0.638f, 0.538f});
+  copper.metallic = 1;
+  copper.roughness = roughness;
+  Material plastic = LambertMaterial("plastic", {0.05f, 0.16f, 0.55f});
+  plastic.roughness = roughness;
+  const auto of_copper = static_cast<int32_t>(scene.materials.size());
+  scene.materials.push_back(std::move(copper));
+  scene.materials.push_back(std::move(plastic));
+  for (Mesh& mesh : scene.meshes) {
+    if (mesh.name == "tall") mesh.material = of_copper;
+    if (mesh.name == "short") {
+      mesh = MeshOfSphere("sphere", of_copper + 1, {1.86f, 0.95f, 1.69f}, 0.95f);
+    }
+  }
+  for (Instance& instance : scene.instances) {
+    if (instance.name == "short") instance.name = "sphere";
+  }
   return scene;
 }
 

@@ -14,6 +14,10 @@ namespace farpoint {
 // Albedos: the linear Rec. 709 values commonly derived from the measured spectra.
 Scene MakeCornellBox();
 
+// The Cornell box with gloss: the tall block is of copper, in place of the short one stands a
+// sphere of blue plastic, both of this roughness in [0, 1].
+Scene MakeGlossyCornellBox(float roughness);
+
 // A closed box of edge 2 m about the origin whose inside is Lambert of reflectance `rho` and emits
 // `radiance`; the camera is at its centre. One bounce gives E = pi * rho * radiance everywhere.
 Scene MakeFurnace(float rho, float radiance);

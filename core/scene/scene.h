@@ -43,14 +43,20 @@ struct TextureRef {
 
 struct Material {
   std::string name;
-  Rgb base_color{1, 1, 1};  // linear, [0, 1]; Lambert albedo
+  Rgb base_color{1, 1, 1};  // linear, [0, 1]; Lambert albedo, or that of glTF's model
   float base_alpha = 1;
   TextureRef base_color_texture;  // sRGB, multiplies base_color and base_alpha
   AlphaMode alpha_mode = AlphaMode::kOpaque;
   float alpha_cutoff = 0.5f;    // kMask: a point with alpha below it is a hole
   Rgb emission;                 // radiance, emitted from both sides (all surfaces are two-sided)
   TextureRef emission_texture;  // sRGB, multiplies emission
-  float metallic = 1, roughness = 1;  // read and kept; every material is Lambert for now
+  // Shown if PrepareOptions::gloss is set; else every material is Lambert (core/math/microfacet.h).
+  // A material without metal, of roughness 1 and without their texture is Lambert anyway.
+  float metallic = 0, roughness = 1;
+  float dielectric_f0 = 0.04f;  // reflectance at normal incidence where it is no metal, [0, 1)
+  TextureRef metal_roughness_texture;  // linear: green multiplies roughness, blue metallic
+  TextureRef normal_texture;           // linear: 2 rgb - 1, in the frame of its coordinates
+  float normal_scale = 1;              // of its x and y
 };
 
 // One primitive: triangles of one material.
