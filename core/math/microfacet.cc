@@ -18,6 +18,8 @@ constexpr uint32_t kTableSamples = 1024;
 constexpr float kLeastCosine = 1e-3f;
 // Of draws by the cosine: what they are for would else get none where it is faint.
 constexpr float kLeastCosineShare = 0.05f;
+// Light that is reflected more than once counts from this part of all on.
+constexpr float kNegligible = 5e-5f;
 
 float Fresnel(float cosine) {
   const float x = std::clamp(1.0f - cosine, 0.0f, 1.0f);
@@ -217,12 +219,16 @@ MicrofacetBrdf::MicrofacetBrdf(const MicrofacetMaterial& m, const Vec3f& wo_loca
     multiple[c] = (dielectric_ms_ + (of_metal - dielectric_ms_) * m.metallic) * lost;
     single[c] = at.fresnel + f0_[c] * at.rest;
   }
+  const float first = std::max(Luminance(single), 1e-4f);
+  // What does not matter would cost draws that a mirror needs.
+  if (1.0f - mean.all() < kNegligible) multiple = Rgb();
   ms_ = multiple * (kInvPif / lost_mean);
   glossy_albedo_ = single + multiple;
-  const float first = std::max(Luminance(single), 1e-4f);
-  glossy_share_ = std::min(first / (first + Luminance(multiple)), 1.0f - kLeastCosineShare);
-  whole_share_ = std::min(first / (first + Luminance(multiple) + Luminance(diffuse_albedo_)),
-                          1.0f - kLeastCosineShare);
+  const auto share_beside = [&](float others) {
+    return others > 0.0f ? std::min(first / (first + others), 1.0f - kLeastCosineShare) : 1.0f;
+  };
+  glossy_share_ = share_beside(Luminance(multiple));
+  whole_share_ = share_beside(Luminance(multiple) + Luminance(diffuse_albedo_));
 }
 
 MicrofacetBrdf::Value MicrofacetBrdf::Evaluate(const Vec3f& wi) const {
