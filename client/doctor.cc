@@ -51,6 +51,10 @@ std::string Size(uint64_t bytes) {
   return text;
 }
 
+std::string Count(size_t count, const std::string& noun) {
+  return std::to_string(count) + " " + noun + (count == 1 ? "" : "s");
+}
+
 class Report {
  public:
   void Good(std::string what, std::string text) {
@@ -219,8 +223,8 @@ void LookAtScene(const DoctorRequest& request, const std::optional<CoordinatorHe
                    " already; wait until older jobs are purged, or raise farpoint-server's "
                    "--max-bytes-per-client");
   }
-  report.Good("scene", request.scene + ": " + std::to_string(asset->files.size()) + " files, " +
-                           Size(bytes));
+  report.Good("scene",
+              request.scene + ": " + Count(asset->files.size(), "file") + ", " + Size(bytes));
 }
 
 // --- The way to the coordinator ---------------------------------------------------------------
@@ -440,17 +444,21 @@ std::vector<Finding> JudgeCoordinator(const CoordinatorHealth& health, const Own
 
 std::vector<Finding> JudgeWorkers(std::span<const WorkerStatus> workers) {
   Report report;
-  if (workers.empty()) {
-    report.Bad(
-        "workers",
-        "no worker is registered, so no tile is rendered; start farpoint-worker --coordinator "
-        "HOST:PORT (its log says what keeps it away)",
-        absl::StatusCode::kUnavailable);
+  if (std::all_of(workers.begin(), workers.end(), [](const auto& w) { return w.gone; })) {
+    report.Bad("workers",
+               std::string(workers.empty() ? "no worker is registered" : "all workers are gone") +
+                   ", so no tile is rendered; start farpoint-worker --coordinator "
+                   "HOST:PORT (its log says what keeps it away)",
+               absl::StatusCode::kUnavailable);
     return std::move(report.findings);
   }
   std::map<Digest, std::vector<std::string>> by_fingerprint;
-  size_t set_aside = 0;
+  size_t set_aside = 0, gone = 0;
   for (const WorkerStatus& worker : workers) {
+    if (worker.gone) {
+      ++gone;
+      continue;
+    }
     by_fingerprint[worker.fingerprint].push_back(worker.name);
     set_aside += worker.set_aside ? 1 : 0;
   }
@@ -467,19 +475,26 @@ std::vector<Finding> JudgeWorkers(std::span<const WorkerStatus> workers) {
       }
     }
     report.Bad("fingerprints",
-               std::to_string(count) + " of " + std::to_string(workers.size()) + " workers (" +
+               std::to_string(count) + " of " + Count(workers.size() - gone, "worker") + " (" +
                    odd + (count > 3 ? ", …" : "") +
                    ") compute other pixels than the rest and get no tile of the same job; "
                    "use one build and one make of processor for all workers");
   }
   if (set_aside > 0) {
-    report.Bad("workers",
-               std::to_string(set_aside) + " of " + std::to_string(workers.size()) +
-                   " workers failed again and again and get no work for a while; farpoint "
-                   "workers names them, their logs say why");
+    report.Bad("workers", std::to_string(set_aside) + " of " +
+                              Count(workers.size() - gone, "worker") +
+                              " failed again and again and get no work for a while; farpoint "
+                              "workers names them, their logs say why");
   }
   if (report.findings.empty()) {
-    report.Good("workers", std::to_string(workers.size()) + " workers are there and agree");
+    const size_t there = workers.size() - gone;
+    report.Good("workers", there == 1 ? "1 worker is there"
+                                      : std::to_string(there) + " workers are there and agree");
+  }
+  if (gone > 0) {
+    report.Doubt("workers", Count(gone, "worker") + (gone == 1 ? " is" : " are") +
+                                " gone: killed, or cut off; farpoint workers names " +
+                                (gone == 1 ? "it" : "them"));
   }
   return std::move(report.findings);
 }

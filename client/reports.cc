@@ -60,7 +60,7 @@ Json ToJson(const WorkerStatus& worker) {
           {"version", worker.version},   {"threads", worker.threads},
           {"leases", worker.leases},     {"committed", worker.committed},
           {"failures", worker.failures}, {"set_aside", worker.set_aside},
-          {"idle_s", worker.idle_s}};
+          {"idle_s", worker.idle_s},     {"gone", worker.gone}};
 }
 
 template <typename T>
@@ -247,13 +247,15 @@ std::string FarmStatusText(const FarmStatus& status) {
 }
 
 std::string WorkersText(std::span<const WorkerStatus> workers) {
+  if (workers.empty()) return "no worker is registered; start farpoint-worker\n";
   std::string text = "WORKER            THREADS  LEASES  TILES    FAILURES  IDLE     NAME\n";
   for (const WorkerStatus& worker : workers) {
     text += Format("%-17s %-8u %-7u %-8llu %-9llu %-8s ", worker.id.value.c_str(), worker.threads,
                    worker.leases, static_cast<unsigned long long>(worker.committed),
                    static_cast<unsigned long long>(worker.failures),
                    DurationText(worker.idle_s).c_str()) +
-            worker.name + (worker.set_aside ? " (set aside)" : "") + "\n";
+            worker.name + (worker.set_aside ? " (set aside)" : "") +
+            (worker.gone ? " (gone)" : "") + "\n";
   }
   return text;
 }

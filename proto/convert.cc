@@ -903,6 +903,7 @@ absl::StatusOr<WorkerStatus> WorkerStatusFromWire(const v1::WorkerStatus& wire) 
   status.set_aside = wire.set_aside();
   FP_RETURN_IF_ERROR(CheckRange(wire.idle_s(), 0, 1e12, "worker.idle_s"));
   status.idle_s = wire.idle_s();
+  status.gone = wire.gone();
   return status;
 }
 v1::WorkerStatus ToWire(const WorkerStatus& status) {
@@ -917,6 +918,7 @@ v1::WorkerStatus ToWire(const WorkerStatus& status) {
   wire.set_failures(status.failures);
   wire.set_set_aside(status.set_aside);
   wire.set_idle_s(status.idle_s);
+  wire.set_gone(status.gone);
   return wire;
 }
 

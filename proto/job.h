@@ -206,6 +206,7 @@ struct WorkerStatus {
   uint64_t failures = 0;
   bool set_aside = false;
   double idle_s = 0;  // since it was last heard of
+  bool gone = false;  // its connection broke or it is silent: it may come back, or be forgotten
 };
 
 struct TileCommitted {

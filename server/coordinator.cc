@@ -496,7 +496,8 @@ class CoordinatorImpl final : public Coordinator {
     welcome.max_wait = std::chrono::milliseconds(10000);
     scheduler_.AddWorker(welcome.id, hello);
     LogWorker(LogLevel::kInfo,
-              "registered '" + hello.name + "', " + std::to_string(hello.threads) + " threads",
+              "registered '" + hello.name + "', " + std::to_string(hello.threads) +
+                  (hello.threads == 1 ? " thread" : " threads"),
               welcome.id);
     return welcome;
   }

@@ -94,8 +94,12 @@ std::string CoordinatorMeter::Metrics(const Surroundings& surroundings) {
     refused += job.refused_results;
     if (!IsFinal(job.state) && job.state != JobState::kPaused) queue += job.tiles.queued;
   }
-  double busy = 0, set_aside = 0, threads = 0;
+  double busy = 0, set_aside = 0, gone = 0, threads = 0;
   for (const WorkerStatus& worker : workers) {
+    if (worker.gone) {
+      gone += 1;
+      continue;
+    }
     threads += worker.threads;
     if (worker.set_aside) {
       set_aside += 1;
@@ -117,9 +121,11 @@ std::string CoordinatorMeter::Metrics(const Surroundings& surroundings) {
               static_cast<double>(queue));
   text.Family("farpoint_workers", "gauge", "Workers that are registered, by state.");
   text.Sample(busy, {{"state", "busy"}});
-  text.Sample(static_cast<double>(workers.size()) - busy - set_aside, {{"state", "idle"}});
+  text.Sample(static_cast<double>(workers.size()) - busy - set_aside - gone, {{"state", "idle"}});
   text.Sample(set_aside, {{"state", "set_aside"}});
-  text.Single("farpoint_worker_threads", "gauge", "Threads of all registered workers.", threads);
+  text.Sample(gone, {{"state", "gone"}});
+  text.Single("farpoint_worker_threads", "gauge", "Threads of all workers that are there.",
+              threads);
   text.Single("farpoint_worker_registrations_total", "counter", "Registrations of workers.",
               Value(registered_));
   text.Single("farpoint_submissions_total", "counter",

@@ -131,16 +131,23 @@ void ExplainWorkers(const ExplanationFacts& facts, std::vector<std::string>& lin
     lines.push_back("no worker is connected; start farpoint-worker --coordinator HOST:PORT");
     return;
   }
-  size_t set_aside = 0, foreign = 0;
+  size_t set_aside = 0, foreign = 0, gone = 0;
   for (const WorkerStatus& worker : facts.workers) {
-    if (!facts.report.fingerprint.empty() && worker.fingerprint != facts.report.fingerprint) {
+    if (worker.gone) {
+      ++gone;
+    } else if (!facts.report.fingerprint.empty() &&
+               worker.fingerprint != facts.report.fingerprint) {
       ++foreign;
     } else if (worker.set_aside) {
       ++set_aside;
     }
   }
-  const size_t all = facts.workers.size();
-  if (foreign == all) {
+  const size_t all = facts.workers.size() - gone;
+  if (all == 0) {
+    lines.push_back(Count(gone, "worker is", "workers are") +
+                    " gone, killed or cut off, and no other one is there; start farpoint-worker "
+                    "--coordinator HOST:PORT");
+  } else if (foreign == all) {
     lines.push_back("none of " + Count(all, "worker", "workers") +
                     " computes as those that rendered its first tiles did (fingerprint " +
                     facts.report.fingerprint.Hex().substr(0, 12) +

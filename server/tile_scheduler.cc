@@ -431,6 +431,7 @@ std::vector<WorkerStatus> TileScheduler::Workers() const {
     status.failures = worker.failures;
     status.set_aside = IsSetAside(worker);
     status.idle_s = Seconds(clock_.Now() - worker.heard);
+    status.gone = !IsThere(worker);
     all.push_back(std::move(status));
   }
   return all;

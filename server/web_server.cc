@@ -76,10 +76,15 @@ Json ToJson(const JobStatus& job, const std::string& owner) {
 }
 
 Json ToJson(const WorkerStatus& worker) {
-  return {{"id", worker.id.value},         {"name", worker.name},
-          {"threads", worker.threads},     {"leases", worker.leases},
-          {"committed", worker.committed}, {"failures", worker.failures},
-          {"set_aside", worker.set_aside}, {"idle_s", worker.idle_s}};
+  return {{"id", worker.id.value},
+          {"name", worker.name},
+          {"threads", worker.threads},
+          {"leases", worker.leases},
+          {"committed", worker.committed},
+          {"failures", worker.failures},
+          {"set_aside", worker.set_aside},
+          {"idle_s", worker.idle_s},
+          {"gone", worker.gone}};
 }
 
 const char* NameOfState(TileView::State state) {

@@ -131,7 +131,7 @@ function showWorkers() {
   sync(byId('workers'), workers, (worker) => worker.id,
        () => element('tr', {}, ...Array.from({length: 5}, () => element('td'))),
        (row, worker) => {
-         const state = worker.set_aside ? 'set aside' : worker.leases > 0 ? 'busy' : 'idle';
+         const state = worker.gone ? 'gone' : worker.set_aside ? 'set aside' : worker.leases > 0 ? 'busy' : 'idle';
          const texts = [worker.name || worker.id, worker.threads, worker.committed, worker.failures,
                         worker.idle_s > 5 ? `${state}, silent ${duration(worker.idle_s)}` : state];
          texts.forEach((text, i) => {

@@ -369,7 +369,8 @@ TEST_F(Doctor, Seed24NoWorkers) {
   EXPECT_EQ(exit_code_, 75);
 }
 TEST_F(Doctor, Seed25WorkersThatComputeOtherPixels) {
-  farm_.StartServer();
+  // They say nothing after they have registered.
+  farm_.StartServer({"--silence-ms", "600000"});
   const auto workers = v1::WorkerService::NewStub(OpenChannel(farm_.address()));
   for (const char* name : {"epyc1", "epyc2", "xeon"}) {
     grpc::ClientContext context;
@@ -382,6 +383,29 @@ TEST_F(Doctor, Seed25WorkersThatComputeOtherPixels) {
     ASSERT_TRUE(workers->Register(&context, ToWire(hello), &response).ok());
   }
   ExpectFault("fingerprints", "1 of 3 workers ('xeon')", "one make of processor", Here());
+}
+TEST_F(Doctor, Seed25bWorkersThatAreGone) {
+  farm_.StartServer();
+  farm_.StartWorker();
+  farm_.StartWorker();
+  farm_.worker(0).Signal(SIGKILL);
+  const auto gone = [&](size_t count) {
+    return WaitUntil(seconds(60), [&] {
+      const std::string status = farm_.Status();
+      if (status.empty()) return false;
+      const Json workers = Json::parse(status)["workers"];
+      return static_cast<size_t>(std::count_if(workers.begin(), workers.end(), [](const Json& one) {
+               return one["gone"] == true;
+             })) == count;
+    });
+  };
+  ASSERT_TRUE(gone(1)) << farm_.Logs();
+  EXPECT_TRUE(Faults(Here()).empty());
+  EXPECT_THAT(last_text_, HasSubstr("1 worker is gone"));
+  EXPECT_THAT(last_text_, HasSubstr("1 worker is there"));
+  farm_.worker(1).Signal(SIGKILL);
+  ASSERT_TRUE(gone(2)) << farm_.Logs();
+  ExpectFault("workers", "all workers are gone", "start farpoint-worker", Here());
 }
 TEST_F(Doctor, Seed26ADrainingCoordinator) {
   farm_.StartServer({"--drain-seconds", "60"});

@@ -135,6 +135,11 @@ TEST(FarmStatusText, HasALinePerJobAndWorker) {
   EXPECT_NE(text.find("node7"), std::string::npos) << text;
   EXPECT_NE(WorkersText(status.workers).find("node7"), std::string::npos);
   EXPECT_EQ(Json::parse(WorkersJson(status.workers))["workers"][0]["name"], "node7");
+  EXPECT_EQ(WorkersText(status.workers).find("gone"), std::string::npos);
+  status.workers[0].gone = true;
+  EXPECT_NE(WorkersText(status.workers).find("node7 (gone)"), std::string::npos);
+  EXPECT_EQ(Json::parse(WorkersJson(status.workers))["workers"][0]["gone"], true);
+  EXPECT_NE(WorkersText({}).find("no worker is registered"), std::string::npos);
 
   status.jobs[0] = MakeSampleJob({64, 64, {0, 0, 64, 64}}, {1, 2, 3}).info.status;
   status.jobs[0].state = JobState::kPaused;

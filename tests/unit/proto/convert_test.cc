@@ -527,9 +527,11 @@ TEST(Convert, WorkerStatusSurvivesTheWire) {
   status.failures = 5;
   status.set_aside = true;
   status.idle_s = 0.5;
+  status.gone = true;
   const absl::StatusOr<WorkerStatus> back = WorkerStatusFromWire(ToWire(status));
   ASSERT_TRUE(back.ok()) << back.status();
   EXPECT_EQ(ToWire(*back).SerializeAsString(), ToWire(status).SerializeAsString());
+  EXPECT_TRUE(back->gone);
 }
 
 TEST(Convert, NeighbouringProtocolsAgreeOnTheNewestThatBothSpeak) {

@@ -70,6 +70,15 @@ TEST(Explanation, NamesWhatAJobWaitsFor) {
   EXPECT_THAT(explanation.lines, Contains(AllOf(HasSubstr("22222222"), HasSubstr("not known"))));
 }
 
+TEST(Explanation, CountsNoWorkerThatIsGone) {
+  ExplanationFacts facts = Facts();
+  facts.workers[0].gone = true;
+  EXPECT_THAT(Explain(facts).lines,
+              Contains(AllOf(HasSubstr("1 worker is gone"), HasSubstr("start farpoint-worker"))));
+  facts.workers.push_back(Facts().workers[0]);
+  EXPECT_THAT(Explain(facts).lines, Not(Contains(HasSubstr("gone"))));
+}
+
 TEST(Explanation, TellsThePlaceInTheBakeQueue) {
   ExplanationFacts facts = Facts();
   facts.bake_place = 2;

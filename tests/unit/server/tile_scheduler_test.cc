@@ -13,7 +13,10 @@ namespace {
 using std::chrono::milliseconds;
 using std::chrono::seconds;
 using ::testing::AllOf;
+using ::testing::Contains;
+using ::testing::Each;
 using ::testing::ElementsAre;
+using ::testing::Field;
 using ::testing::HasSubstr;
 using ::testing::IsEmpty;
 
@@ -277,7 +280,12 @@ TEST_F(TileSchedulerTest, ABrokenConnectionCostsTheLeaseAtOnce) {
   EXPECT_THAT(scheduler_.Tick().lost, IsEmpty());
 
   const uint64_t third = scheduler_.Connected(w);
+  EXPECT_THAT(scheduler_.Workers(), Each(Field(&WorkerStatus::gone, false)));
+  clock_.Advance(milliseconds(1));
   scheduler_.Disconnected(w, third);
+  // Whoever looks is told at once that it is not there, until it is heard of again.
+  EXPECT_THAT(scheduler_.Workers(),
+              Contains(AllOf(Field(&WorkerStatus::id, w), Field(&WorkerStatus::gone, true))));
   clock_.Advance(options_.reconnect_time);
   const SchedulerNews news = scheduler_.Tick();
   ASSERT_EQ(news.lost.size(), 1u);
