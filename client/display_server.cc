@@ -1,7 +1,6 @@
 #include "client/display_server.h"
 
 #include <fcntl.h>
-#include <netdb.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
@@ -26,7 +25,7 @@
 
 #include "client/tev_packet.h"
 #include "core/base/status.h"
-#include "proto/access.h"
+#include "proto/resolve.h"
 
 namespace farpoint {
 namespace {
@@ -213,18 +212,9 @@ struct DisplayServer::State {
   }
 
   absl::StatusOr<Socket> Connect() {
-    const HostPort parts = SplitHostPort(options.address);
-    addrinfo hints{};
-    hints.ai_socktype = SOCK_STREAM;
-    addrinfo* list = nullptr;
-    if (const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
-        error != 0) {
-      return absl::UnavailableError(std::string("the address is not known: ") +
-                                    ::gai_strerror(error));
-    }
-    const std::unique_ptr<addrinfo, decltype(&::freeaddrinfo)> owned(list, ::freeaddrinfo);
+    FP_ASSIGN_OR_RETURN(const AddressList list, Resolve(options.address));
     absl::Status last = absl::UnavailableError("the host has no address");
-    for (const addrinfo* address = list; address != nullptr; address = address->ai_next) {
+    for (const addrinfo* address = list.get(); address != nullptr; address = address->ai_next) {
       auto socket = ConnectTo(*address);
       if (socket.ok()) return socket;
       last = socket.status();

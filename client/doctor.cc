@@ -1,6 +1,5 @@
 #include "client/doctor.h"
 
-#include <netdb.h>
 #include <netinet/in.h>
 #include <sys/socket.h>
 #include <unistd.h>
@@ -19,6 +18,7 @@
 #include "client/exit_code.h"
 #include "core/base/posix_file.h"
 #include "core/scene/asset.h"
+#include "proto/resolve.h"
 
 namespace farpoint {
 
@@ -116,18 +116,14 @@ void LookAtFolder(const std::string& what, const std::string& flag, const std::s
 }
 
 void LookAtPort(const std::string& address, Report& report) {
-  const HostPort parts = SplitHostPort(address);
-  addrinfo hints{};
-  hints.ai_socktype = SOCK_STREAM;
-  hints.ai_flags = AI_PASSIVE;
-  addrinfo* list = nullptr;
-  if (const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
-      error != 0) {
-    return report.Bad("listen", "--listen " + address + ": " + ::gai_strerror(error) +
+  const absl::StatusOr<AddressList> list = Resolve(address, ResolveFor::kListening);
+  if (!list.ok()) {
+    return report.Bad("listen", "--listen " + address + ": " +
+                                    std::string(list.status().message()) +
                                     "; name an address of this machine, as in 0.0.0.0:7447");
   }
   int failed = 0;
-  for (const addrinfo* at = list; at != nullptr && failed == 0; at = at->ai_next) {
+  for (const addrinfo* at = list->get(); at != nullptr && failed == 0; at = at->ai_next) {
     const Descriptor fd(::socket(at->ai_family, SOCK_STREAM | SOCK_CLOEXEC, 0));
     const int on = 1;
     if (!fd.valid()) continue;
@@ -137,7 +133,6 @@ void LookAtPort(const std::string& address, Report& report) {
     if (::bind(fd.get(), at->ai_addr, at->ai_addrlen) != 0 || ::listen(fd.get(), 1) != 0)
       failed = errno;
   }
-  ::freeaddrinfo(list);
   switch (failed) {
     case 0:
       return report.Good("listen", "--listen " + address + " is free");

@@ -8,7 +8,6 @@
 #include <utility>
 #include <vector>
 
-#include "client/eta.h"
 #include "client/stitcher.h"
 
 namespace farpoint {
@@ -111,7 +110,6 @@ absl::Status JobRun::Wait(const JobId& job, const FrameSink& sink) {
   std::vector<bool> taken;
   size_t taken_count = 0;
   SteadyTime next_take = SteadyTime::min();
-  EtaEstimator eta;
   std::map<uint32_t, Digest> to_show;
   SteadyTime next_show = SteadyTime::min();
   while (true) {
@@ -123,12 +121,8 @@ absl::Status JobRun::Wait(const JobId& job, const FrameSink& sink) {
         if (event.sequence > 0) last_sequence = event.sequence;
         last = event.status;
         if (const auto* note = std::get_if<std::string>(&event.body)) console_.Info(*note);
+        console_.Progress(event.status);
         const SteadyTime now = std::chrono::steady_clock::now();
-        const double now_s = std::chrono::duration<double>(now.time_since_epoch()).count();
-        eta.Update(event.status, now_s);
-        JobStatus shown = event.status;
-        if (const std::optional<double> left = eta.SecondsLeft(now_s)) shown.eta_s = left;
-        console_.Progress(shown);
         const auto* tile = std::get_if<TileCommitted>(&event.body);
         if (tile != nullptr && tile_sink_ != nullptr) to_show[tile->tile] = tile->sha256;
         show = !to_show.empty() && !IsFinal(last.state) && now >= next_show;

@@ -1,7 +1,6 @@
 #include "proto/connection_probe.h"
 
 #include <fcntl.h>
-#include <netdb.h>
 #include <openssl/bio.h>
 #include <openssl/err.h>
 #include <openssl/pem.h>
@@ -19,6 +18,7 @@
 
 #include "core/base/blob.h"
 #include "core/base/posix_file.h"
+#include "proto/resolve.h"
 
 namespace farpoint {
 
@@ -42,9 +42,6 @@ struct SslDeleter {
 };
 struct BioDeleter {
   void operator()(BIO* bio) const { BIO_free_all(bio); }
-};
-struct AddressesDeleter {
-  void operator()(addrinfo* list) const { ::freeaddrinfo(list); }
 };
 using SslContextPtr = std::unique_ptr<SSL_CTX, SslContextDeleter>;
 using SslPtr = std::unique_ptr<SSL, SslDeleter>;
@@ -91,20 +88,13 @@ absl::Status NoConnection(const std::string& address, int error) {
 }
 
 absl::StatusOr<Descriptor> Connect(const std::string& address, Clock::time_point end) {
-  const HostPort parts = SplitHostPort(address);
-  addrinfo hints{};
-  hints.ai_family = AF_UNSPEC;
-  hints.ai_socktype = SOCK_STREAM;
-  addrinfo* list = nullptr;
-  if (const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
-      error != 0) {
-    return absl::UnavailableError("the name '" + parts.host + "' does not resolve (" +
-                                  ::gai_strerror(error) +
-                                  "); check its spelling, /etc/hosts and the name server");
+  const absl::StatusOr<AddressList> list = Resolve(address);
+  if (!list.ok()) {
+    return absl::UnavailableError(std::string(list.status().message()) +
+                                  "; check its spelling, /etc/hosts and the name server");
   }
-  const std::unique_ptr<addrinfo, AddressesDeleter> owner(list);
   int error = ECONNREFUSED;
-  for (const addrinfo* at = list; at != nullptr; at = at->ai_next) {
+  for (const addrinfo* at = list->get(); at != nullptr; at = at->ai_next) {
     Descriptor fd(::socket(at->ai_family, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
     if (!fd.valid()) {
       error = errno;

@@ -6,7 +6,6 @@
 #include <grpcpp/security/credentials.h>
 #include <grpcpp/support/byte_buffer.h>
 #include <grpcpp/support/channel_arguments.h>
-#include <netdb.h>
 #include <sys/socket.h>
 #include <sys/time.h>
 
@@ -21,6 +20,7 @@
 #include "proto/connection_probe.h"
 #include "proto/grpc_channel.h"
 #include "proto/grpc_status.h"
+#include "proto/resolve.h"
 
 namespace farpoint {
 
@@ -47,20 +47,10 @@ std::optional<Serving> Decode(const grpc::ByteBuffer& buffer) {
 
 // Sending, receiving and connecting each end after `timeout`.
 absl::StatusOr<Descriptor> Connect(const std::string& address, std::chrono::milliseconds timeout) {
-  const HostPort parts = SplitHostPort(address);
-  addrinfo hints{};
-  hints.ai_family = AF_UNSPEC;
-  hints.ai_socktype = SOCK_STREAM;
-  addrinfo* list = nullptr;
-  if (const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
-      error != 0) {
-    return absl::UnavailableError("the name '" + parts.host + "' does not resolve (" +
-                                  ::gai_strerror(error) + ")");
-  }
-  const std::unique_ptr<addrinfo, decltype(&::freeaddrinfo)> owner(list, &::freeaddrinfo);
+  FP_ASSIGN_OR_RETURN(const AddressList list, Resolve(address));
   const timeval limit{.tv_sec = timeout.count() / 1000, .tv_usec = timeout.count() % 1000 * 1000};
   int error = ECONNREFUSED;
-  for (const addrinfo* at = list; at != nullptr; at = at->ai_next) {
+  for (const addrinfo* at = list.get(); at != nullptr; at = at->ai_next) {
     Descriptor fd(::socket(at->ai_family, SOCK_STREAM | SOCK_CLOEXEC, 0));
     if (fd.valid() && ::setsockopt(fd.get(), SOL_SOCKET, SO_RCVTIMEO, &limit, sizeof(limit)) == 0 &&
         ::setsockopt(fd.get(), SOL_SOCKET, SO_SNDTIMEO, &limit, sizeof(limit)) == 0 &&

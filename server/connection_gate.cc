@@ -2,7 +2,6 @@
 
 #include <arpa/inet.h>
 #include <fcntl.h>
-#include <netdb.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
@@ -25,7 +24,7 @@
 #include <vector>
 
 #include "core/base/posix_file.h"
-#include "proto/access.h"
+#include "proto/resolve.h"
 
 namespace farpoint {
 
@@ -55,10 +54,6 @@ constexpr std::string_view kHttpAnswer =
     "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
     "This is the port of farpoint-server, which speaks gRPC: farpoint status --coordinator "
     "HOST:PORT\n";
-
-struct AddressesDeleter {
-  void operator()(addrinfo* list) const { ::freeaddrinfo(list); }
-};
 
 std::string HostOf(const sockaddr_storage& address) {
   char text[INET6_ADDRSTRLEN] = "?";
@@ -147,20 +142,14 @@ class Gate final : public ConnectionGate {
   ~Gate() override { Stop(); }
 
   absl::Status Listen() {
-    const HostPort parts = SplitHostPort(options_.address);
-    addrinfo hints{};
-    hints.ai_family = AF_UNSPEC;
-    hints.ai_socktype = SOCK_STREAM;
-    hints.ai_flags = AI_PASSIVE;
-    addrinfo* list = nullptr;
-    if (const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
-        error != 0) {
-      return absl::UnavailableError("cannot listen on '" + options_.address + "': " +
-                                    ::gai_strerror(error) + "; name an address of this machine");
+    const absl::StatusOr<AddressList> list = Resolve(options_.address, ResolveFor::kListening);
+    if (!list.ok()) {
+      return absl::UnavailableError("cannot listen on '" + options_.address +
+                                    "': " + std::string(list.status().message()) +
+                                    "; name an address of this machine");
     }
-    const std::unique_ptr<addrinfo, AddressesDeleter> owner(list);
     absl::Status failed;
-    for (const addrinfo* at = list; at != nullptr; at = at->ai_next) {
+    for (const addrinfo* at = list->get(); at != nullptr; at = at->ai_next) {
       const absl::Status status = ListenOn(*at);
       if (!status.ok()) failed = status;
     }

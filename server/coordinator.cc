@@ -37,6 +37,9 @@ constexpr size_t kSlowestTiles = 3;
 // So much of a job's tiles is hashed when the coordinator starts, so that it starts soon.
 constexpr uint64_t kReadAtRestart = uint64_t{128} << 20;
 constexpr uint32_t kProblems = 5;
+// The usual part of a tile's cost that its neighbours share, with the records of adaptive clusters
+// and without; from recorded commits of seven scenes (docs/decisions/0030).
+constexpr double kSharedByNeighbours = 0.25, kSharedElsewhere = 0.04;
 
 int64_t UnixMs() {
   return std::chrono::duration_cast<std::chrono::milliseconds>(
@@ -1068,6 +1071,9 @@ class CoordinatorImpl final : public Coordinator {
     scheduled.number = stored.number;
     scheduled.tiles = job.total_tiles();
     scheduled.frame_tiles = frame_tiles;
+    scheduled.frame_rects = job.tiles;
+    scheduled.usual_share =
+        stored.spec.settings.adaptive() ? kSharedByNeighbours : kSharedElsewhere;
     for (const StoredTile& tile : committed) {
       if (tile.tile >= scheduled.tiles) continue;
       scheduled.committed.push_back(tile.tile);

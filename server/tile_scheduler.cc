@@ -109,6 +109,7 @@ void TileScheduler::AddJob(const ScheduledJob& spec) {
   job.counts.committed = static_cast<uint32_t>(spec.committed.size());
   job.counts.queued = spec.tiles - job.counts.committed;
   if (spec.paused) job.paused_at = clock_.Now();
+  RestartTimeLeft(job);
   Rerank(jobs_.emplace(spec.id, std::move(job)).first->second);
 }
 
@@ -194,11 +195,23 @@ std::optional<double> TileScheduler::EtaSeconds(const JobId& id) const {
   if (at == jobs_.end()) return std::nullopt;
   const Job& job = at->second;
   if (job.counts.committed == job.counts.total) return 0;
-  if (!job.started || job.committed_here == 0 || job.paused_at) return std::nullopt;
-  const double total = job.counts.total;
-  const double here = Progress(id) * total - (job.counts.committed - job.committed_here);
-  const double elapsed = Seconds(clock_.Now() - *job.started);
-  return elapsed * (total - Progress(id) * total) / std::max(here, 1.0);
+  if (!job.started || job.paused_at) return std::nullopt;
+  return job.time_left.SecondsLeft(ElapsedSeconds(job) - job.time_left_from_s);
+}
+
+double TileScheduler::ElapsedSeconds(const Job& job) const {
+  if (!job.started) return 0;
+  return std::max(0.0, Seconds(job.paused_at.value_or(clock_.Now()) - *job.started));
+}
+
+void TileScheduler::RestartTimeLeft(Job& job) const {
+  std::vector<uint32_t> done;
+  for (uint32_t i = 0; i < job.tiles.size(); ++i) {
+    if (job.tiles[i].state == TileState::kCommitted) done.push_back(i);
+  }
+  job.time_left = TimeLeft(job.spec.tiles, job.spec.frame_tiles, job.spec.frame_rects, done,
+                           job.spec.usual_share);
+  job.time_left_from_s = ElapsedSeconds(job);
 }
 
 uint64_t TileScheduler::Reissued(const JobId& id) const {
@@ -472,6 +485,13 @@ bool TileScheduler::AnotherWorkerCouldTake(const Job& job, const Tile& tile,
   return false;
 }
 
+bool TileScheduler::IsAlone(const Job& job, const WorkerId& but) const {
+  return std::none_of(workers_.begin(), workers_.end(), [&](const auto& entry) {
+    const auto& [id, worker] = entry;
+    return id != but && !IsSetAside(worker) && TakesFingerprint(job, worker) && IsThere(worker);
+  });
+}
+
 bool TileScheduler::SomeWorkerCouldAudit(const Job& job, const Audit& audit) const {
   for (const auto& [id, worker] : workers_) {
     if (IsSetAside(worker) || audit.HasOpinionOf(OwnerOf(worker.hello))) continue;
@@ -560,17 +580,23 @@ std::optional<uint32_t> TileScheduler::PickTile(Job& job, const WorkerId& id) {
     return std::nullopt;
   };
   const uint32_t first = *fresh_from(0);
+  const uint32_t frame = job.spec.frame_tiles == 0 ? job.spec.tiles : job.spec.frame_tiles;
+  const uint32_t end = std::min((first / frame + 1) * frame, job.spec.tiles);
+  if (IsAlone(job, id)) {
+    // Multiples of the golden ratio, which leave no large part of a frame, nor of its rows, unseen.
+    const uint32_t at = job.begun++ * 2654435769u;
+    const uint32_t begin = end - std::min(frame, end);
+    const auto tile = fresh_from(begin + static_cast<uint32_t>(uint64_t{end - begin} * at >> 32));
+    return tile && *tile < end ? *tile : first;
+  }
   const auto last = job.last_tiles.find(id);
   if (last != job.last_tiles.end() && last->second + 1 < job.tiles.size()) {
     const uint32_t next = last->second + 1;
-    const uint32_t frame = job.spec.frame_tiles == 0 ? job.spec.tiles : job.spec.frame_tiles;
     if (next / frame == first / frame && job.queued.contains(next) && !job.again.contains(next)) {
       return next;
     }
   }
   // Halves, quarters, eighths … of what is left of the first frame that is not done.
-  const uint32_t frame = job.spec.frame_tiles == 0 ? job.spec.tiles : job.spec.frame_tiles;
-  const uint32_t end = std::min((first / frame + 1) * frame, job.spec.tiles);
   uint32_t reversed = 0;
   uint32_t number = job.begun++;
   for (int bit = 0; bit < 16; ++bit, number >>= 1) reversed = reversed << 1 | (number & 1);
@@ -732,6 +758,7 @@ bool TileScheduler::FinishCommit(const LeaseId& lease, bool durable, const Diges
   }
   RememberDuration(job, took);
   ++job.committed_here;
+  job.time_left.Commit(live.grant.tile, ElapsedSeconds(job) - job.time_left_from_s);
   Tile& tile = job.tiles[live.grant.tile];
   const std::string name = NameOfWorker(live.grant.worker);
   const auto known = std::find(job.names.begin(), job.names.end(), name);
@@ -843,6 +870,7 @@ void TileScheduler::Convict(const WorkerId& id, const WorkerHello& hello, AuditV
       SetState(job, i, TileState::kQueued);
       verdict.reopened[job_id].push_back(i);
     }
+    if (verdict.reopened.contains(job_id)) RestartTimeLeft(job);
     // If nothing else was committed, any fingerprint may begin again.
     ForgetUnusedFingerprint(job);
   }

@@ -14,8 +14,10 @@
 //   - its job ends, or its job commits a tile of another fingerprint.
 // A queued tile is leased only when it is open (its frame is baked) and its job is not paused.
 //
-// Neighbours share work: a worker goes on with the tile after its last one, and begins, or begins
-// anew where others have been, as far from them as it can. What was tried before goes first.
+// Neighbours share work within a process: a worker goes on with the tile after its last one, and
+// begins, or begins anew where others have been, as far from them as it can. One that is alone
+// finds all that there is in its own process, whatever the order: its tiles are spread over the
+// frame, so that those that are done tell of those that are not. What was tried before goes first.
 //
 // Committing takes two steps, since a result counts when it is durable: BeginCommit pins the lease,
 // FinishCommit ends it. In between the tile counts as leased and no other result is taken.
@@ -54,6 +56,7 @@
 #include "core/base/hash.h"
 #include "core/base/status.h"
 #include "proto/job.h"
+#include "server/time_left.h"
 
 namespace farpoint {
 
@@ -83,8 +86,12 @@ struct ScheduledJob {
   int32_t priority = 0;
   uint64_t number = 0;  // order of submission: age decides between equal priorities
   uint32_t tiles = 0;
-  uint32_t frame_tiles = 0;         // of each frame, one after the other; 0: all are one frame's
-  std::vector<uint32_t> committed;  // tiles that are done already
+  uint32_t frame_tiles = 0;  // of each frame, one after the other; 0: all are one frame's
+  // For the time left (TimeLeft): the tiles of a frame, or none; the part of a tile's cost that
+  // neighbours share.
+  std::vector<PixelRect> frame_rects;
+  double usual_share = 0;
+  std::vector<uint32_t> committed;        // tiles that are done already
   std::vector<std::string> committed_by;  // their workers' names; as many, or none: not known
   Digest fingerprint;                     // of the committed tiles; empty if there are none
   Duration max_time = Duration::max();    // from the first lease on
@@ -185,7 +192,7 @@ class TileScheduler {
   bool HasJob(const JobId& job) const { return jobs_.contains(job); }
   // Tiles [first, first + count) of a job may be leased from now on; those that are open stay so.
   void OpenTiles(const JobId& job, uint32_t first, uint32_t count);
-  // The time of a pause counts neither for max_time nor for the estimated rest.
+  // The time of a pause counts neither for max_time nor for the time left.
   void SetPaused(const JobId& job, bool paused);
   void SetPriority(const JobId& job, int32_t priority);
   // Its tiles count as if they had never failed, on any worker; those set aside are queued again.
@@ -193,6 +200,7 @@ class TileScheduler {
   // Zeros for an unknown job, as the next ones.
   TileCounts Counts(const JobId& job) const;
   double Progress(const JobId& job) const;
+  // Seconds to the last commit, as things go now; none before the first one and during a pause.
   std::optional<double> EtaSeconds(const JobId& job) const;
   uint64_t Reissued(const JobId& job) const;
   uint64_t Refused(const JobId& job) const;
@@ -296,8 +304,10 @@ class TileScheduler {
     Digest fingerprint;
     std::optional<TimePoint> started;  // first lease
     uint32_t committed_here = 0;       // since it was added
-    std::vector<Duration> durations;   // of the last committed tiles
-    Duration median{};                 // of durations
+    TimeLeft time_left;
+    double time_left_from_s = 0;      // of the job's time, when time_left began
+    std::vector<Duration> durations;  // of the last committed tiles
+    Duration median{};                // of durations
     std::optional<TimePoint> paused_at;
     std::map<uint32_t, std::string> causes;  // of the last failure of tiles
     std::vector<std::string> names;          // of workers that committed tiles; [0] is ""
@@ -374,6 +384,11 @@ class TileScheduler {
   void FailJob(Job& job, absl::Status error, std::optional<uint32_t> tile, SchedulerNews& news);
   void SetState(Job& job, uint32_t tile, TileState state);
   void RememberDuration(Job& job, Duration took);
+  // Seconds since the first lease, without pauses.
+  double ElapsedSeconds(const Job& job) const;
+  void RestartTimeLeft(Job& job) const;
+  // No other worker is there that could take its tiles.
+  bool IsAlone(const Job& job, const WorkerId& id) const;
 
   const SchedulerOptions options_;
   const Clock& clock_;

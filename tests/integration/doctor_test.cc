@@ -388,17 +388,19 @@ TEST_F(Doctor, Seed25bWorkersThatAreGone) {
   farm_.StartServer();
   farm_.StartWorker();
   farm_.StartWorker();
-  farm_.worker(0).Signal(SIGKILL);
   const auto gone = [&](size_t count) {
     return WaitUntil(seconds(60), [&] {
       const std::string status = farm_.Status();
       if (status.empty()) return false;
       const Json workers = Json::parse(status)["workers"];
-      return static_cast<size_t>(std::count_if(workers.begin(), workers.end(), [](const Json& one) {
+      return workers.size() == 2 &&
+             static_cast<size_t>(std::count_if(workers.begin(), workers.end(), [](const Json& one) {
                return one["gone"] == true;
              })) == count;
     });
   };
+  ASSERT_TRUE(gone(0)) << farm_.Logs();
+  farm_.worker(0).Signal(SIGKILL);
   ASSERT_TRUE(gone(1)) << farm_.Logs();
   EXPECT_TRUE(Faults(Here()).empty());
   EXPECT_THAT(last_text_, HasSubstr("1 worker is gone"));
