@@ -16,6 +16,9 @@ absl::StatusOr<AddressList> Resolve(std::string_view address, ResolveFor use) {
   if (use == ResolveFor::kListening) hints.ai_flags = AI_PASSIVE;
   addrinfo* list = nullptr;
   const int error = ::getaddrinfo(parts.host.c_str(), parts.port.c_str(), &hints, &list);
+  if (error == EAI_SERVICE) {
+    return absl::UnavailableError("'" + parts.port + "' is not a port");
+  }
   if (error != 0 || list == nullptr) {
     return absl::UnavailableError("the name '" + parts.host + "' does not resolve (" +
                                   (error != 0 ? ::gai_strerror(error) : "no address") + ")");
