@@ -239,7 +239,7 @@ TEST_F(DisplayServerTest, AnUnknownAddressIsTold) {
   DisplayServer display(Options("127.0.0.1:no-such-service"));
   ShowTiles(display, 0, 1);
   ASSERT_TRUE(Eventually([&] { return !Warnings().empty(); }));
-  EXPECT_THAT(Warnings(), ElementsAre(HasSubstr("the address is not known")));
+  EXPECT_THAT(Warnings(), ElementsAre(HasSubstr("'no-such-service' is not a port")));
 }
 
 }  // namespace
