@@ -128,6 +128,22 @@ class Connection final : public httplib::Stream {
   }
   const std::string& certificates() const { return certificates_; }
 
+  // What has come begins as a request of HTTP, not as TLS does. Nothing is taken.
+  bool SpeaksInTheClear() const {
+    char first = 0;
+    return Poll(POLLIN, deadline_) && ::recv(fd_, &first, 1, MSG_PEEK | MSG_DONTWAIT) == 1 &&
+           first >= 'A' && first <= 'Z';
+  }
+  void Refuse() {
+    static constexpr std::string_view kAnswer =
+        "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nContent-Length: 40\r\n"
+        "Connection: close\r\n\r\nthis port speaks TLS; say https:// here\n";
+    // What was said is taken first: closing with something unread would cut the answer off.
+    char said[4096];
+    (void)!::recv(fd_, said, sizeof(said), MSG_DONTWAIT);
+    (void)!write(kAnswer.data(), kAnswer.size());
+  }
+
   // True when another request begins.
   bool Idle() {
     if (ssl_ && SSL_pending(ssl_.get()) > 0) return true;
@@ -323,11 +339,28 @@ class HttpServerImpl final : public HttpServer, private httplib::Server {
     return absl::OkStatus();
   }
   int port() const override { return port_; }
+  absl::Status Renew(const TlsMaterial& tls) override {
+    if (!options_.tls) return absl::FailedPreconditionError("this server speaks in the clear");
+    FP_ASSIGN_OR_RETURN(ContextPtr context, MakeContext(tls, options_.ask_for_certificate));
+    std::lock_guard lock(context_mutex_);
+    context_ = std::move(context);
+    return absl::OkStatus();
+  }
 
  private:
+  std::shared_ptr<SSL_CTX> Context() {
+    std::lock_guard lock(context_mutex_);
+    return context_;
+  }
   bool process_and_close_socket(socket_t fd) override {
     Connection connection(fd, options_, stopping_);
-    if (context_ && !connection.Accept(context_.get())) return false;
+    if (const std::shared_ptr<SSL_CTX> context = Context()) {
+      if (connection.SpeaksInTheClear()) {
+        connection.Refuse();
+        return true;
+      }
+      if (!connection.Accept(context.get())) return false;
+    }
     for (int left = kRequestsPerConnection; left > 0 && !stopping_.load(); --left) {
       if (!connection.Idle()) return true;
       connection.NextRequest();
@@ -376,7 +409,8 @@ class HttpServerImpl final : public HttpServer, private httplib::Server {
 
   const HttpServerOptions options_;
   const HttpServer::Handler handler_;
-  ContextPtr context_;
+  std::mutex context_mutex_;
+  std::shared_ptr<SSL_CTX> context_;  // guarded by context_mutex_; null: in the clear
   std::atomic<bool> stopping_ = false;
   int port_ = -1;
   std::thread thread_;

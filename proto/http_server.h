@@ -1,7 +1,8 @@
 // A small HTTP/1.1 server for people and their tools: short requests, whole answers, in the clear
-// or over TLS. It is built to stand beside a service that matters more: threads, connections, bytes
-// and seconds of a request are bounded. A connection that says nothing is not even taken from the
-// system's queue; others wait there while all threads are busy.
+// or over TLS; who speaks in the clear to one that wants TLS is told so. It is built to stand
+// beside a service that matters more: threads, connections, bytes and seconds of a request are
+// bounded. A connection that says nothing is not even taken from the system's queue; others wait
+// there while all threads are busy.
 #pragma once
 
 #include <chrono>
@@ -62,6 +63,9 @@ class HttpServer {
   // Requests in work are answered first.
   virtual ~HttpServer() = default;
   virtual int port() const = 0;
+  // New connections see this certificate; those that are open go on. kInvalidArgument: it cannot be
+  // used, and the one before stays. kFailedPrecondition: this server speaks in the clear.
+  virtual absl::Status Renew(const TlsMaterial& tls) = 0;
 };
 
 }  // namespace farpoint

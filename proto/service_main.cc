@@ -68,9 +68,7 @@ absl::Status CheckHostPort(std::string_view flag, const std::string& address, bo
   return absl::OkStatus();
 }
 
-std::vector<std::string> LogLevelNames() {
-  return {"trace", "debug", "info", "warn", "warning", "error", "off"};
-}
+std::vector<std::string> LogLevelNames() { return {"debug", "info", "warn", "error", "off"}; }
 
 std::vector<std::string> LogFormatNames() { return {"text", "json"}; }
 
@@ -82,7 +80,8 @@ void StartLog(const std::string& program, const std::string& level, const std::s
   if (g_log.json) spdlog::set_pattern("%v");
 }
 
-void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject) {
+void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject, bool detail) {
+  if (detail && !spdlog::should_log(spdlog::level::debug)) return;
   const std::string line =
       g_log.json ? LogJson(g_log.program, level, subject, text, std::chrono::system_clock::now())
                  : LogText(subject, text);

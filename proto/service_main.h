@@ -44,7 +44,9 @@ struct LogSubject {
 // as far as they are known; ReportFatal writes one, too.
 void StartLog(const std::string& program, const std::string& level,
               const std::string& format = "text");
-void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject = {});
+// `detail`: only at --log-level debug.
+void WriteLog(LogLevel level, const std::string& text, const LogSubject& subject = {},
+              bool detail = false);
 // The lines, without the time and level that the text format has in front.
 // "job=… tile=… attempt=… worker=… text".
 std::string LogText(const LogSubject& subject, std::string_view text);

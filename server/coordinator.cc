@@ -514,7 +514,8 @@ class CoordinatorImpl final : public Coordinator {
       if (!scheduler_.HasWorker(worker)) return UnknownWorker(worker);
       if (const std::optional<LeaseGrant> grant = scheduler_.Lease(worker)) {
         const Job& job = *jobs_.at(grant->job);
-        LogLease(LogLevel::kInfo, grant->speculative ? "copied" : "leased", *grant);
+        LogLease(LogLevel::kInfo, grant->speculative ? "copied" : "leased", *grant,
+                 /*detail=*/true);
         TileWork work;
         work.lease = grant->lease;
         work.attempt = grant->attempt;
@@ -1008,7 +1009,7 @@ class CoordinatorImpl final : public Coordinator {
     for (const LostLease& lost : news.lost) {
       std::string text = "lease lost: " + lost.reason;
       if (lost.worker_set_aside) text += "; the worker is set aside for a while";
-      LogLease(LogLevel::kWarning, text, lost.grant);
+      LogLease(LogLevel::kWarning, text, lost.grant, /*detail=*/false, lost.cause);
       if (const auto at = jobs_.find(lost.grant.job); at != jobs_.end()) {
         lines.push_back({lost.grant.job, Placed(*at->second, {.level = LogLevel::kWarning,
                                                               .text = text,
@@ -1575,14 +1576,17 @@ class CoordinatorImpl final : public Coordinator {
   void LogWorker(LogLevel level, std::string text, const WorkerId& worker) const {
     if (options_.log) options_.log({.level = level, .text = std::move(text), .worker = worker});
   }
-  void LogLease(LogLevel level, std::string text, const LeaseGrant& grant) const {
+  void LogLease(LogLevel level, std::string text, const LeaseGrant& grant, bool detail = false,
+                LossCause lost = LossCause::kReported) const {
     if (!options_.log) return;
     options_.log({.level = level,
                   .text = std::move(text),
                   .job = grant.job,
                   .tile = grant.tile,
                   .attempt = grant.attempt,
-                  .worker = grant.worker});
+                  .worker = grant.worker,
+                  .detail = detail,
+                  .lost = lost});
   }
 
   const CoordinatorOptions options_;

@@ -46,6 +46,7 @@
 #include "core/base/status.h"
 #include "proto/job.h"
 #include "server/blob_writer.h"
+#include "server/loss_cause.h"
 
 namespace farpoint {
 
@@ -161,8 +162,10 @@ struct CoordinatorLogEntry {
   std::string text;
   JobId job;  // may be empty
   std::optional<uint32_t> tile;
-  uint32_t attempt = 0;  // 0: none
-  WorkerId worker;       // may be empty
+  uint32_t attempt = 0;                   // 0: none
+  WorkerId worker;                        // may be empty
+  bool detail = false;                    // of each lease: for whoever wants to see all
+  LossCause lost = LossCause::kReported;  // else: a lease was lost by this
 };
 
 struct CoordinatorOptions {

@@ -48,8 +48,26 @@ std::shared_ptr<SceneBaker> MakeMeteredBaker(std::shared_ptr<SceneBaker> baker,
   return std::make_shared<MeteredBaker>(std::move(baker), std::move(stages));
 }
 
-CoordinatorMeter::CoordinatorMeter(CoordinatorApi& coordinator, std::shared_ptr<StageMeter> stages)
-    : coordinator_(coordinator), stages_(std::move(stages)) {}
+void LossMeter::Count(LossCause cause) {
+  if (cause != LossCause::kReported) ++lost_[static_cast<size_t>(cause)];
+}
+void LossMeter::AddTo(MetricsText& text) const {
+  text.Family("farpoint_leases_lost_total", "counter",
+              "Leases that were lost, by cause: the worker's connection broke, it was silent, its "
+              "tile made no progress, or a render thread hung.");
+  constexpr std::pair<LossCause, const char*> kNames[] = {
+      {LossCause::kDisconnected, "disconnected"},
+      {LossCause::kSilent, "silent"},
+      {LossCause::kNoProgress, "no_progress"},
+      {LossCause::kHung, "hung"}};
+  for (const auto& [cause, name] : kNames) {
+    text.Sample(Value(lost_[static_cast<size_t>(cause)]), {{"cause", name}});
+  }
+}
+
+CoordinatorMeter::CoordinatorMeter(CoordinatorApi& coordinator, std::shared_ptr<StageMeter> stages,
+                                   std::shared_ptr<LossMeter> losses)
+    : coordinator_(coordinator), stages_(std::move(stages)), losses_(std::move(losses)) {}
 CoordinatorMeter::~CoordinatorMeter() = default;
 
 void CoordinatorMeter::Begin(const WorkerId& worker) {
@@ -139,6 +157,7 @@ std::string CoordinatorMeter::Metrics(const Surroundings& surroundings) {
   text.Sample(Value(refused_lease_) + Value(refused_damaged_), {{"outcome", "refused"}});
   text.Sample(Value(failed_), {{"outcome", "failed"}});
   text.Sample(Value(given_back_), {{"outcome", "given_back"}});
+  if (losses_ != nullptr) losses_->AddTo(text);
   text.Family("farpoint_lease_seconds", "histogram", "From lease to accepted result.");
   text.Histogram(lease_times_.Read());
   text.Family(

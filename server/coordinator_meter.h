@@ -36,10 +36,23 @@ class StageMeter {
 std::shared_ptr<SceneBaker> MakeMeteredBaker(std::shared_ptr<SceneBaker> baker,
                                              std::shared_ptr<StageMeter> stages);
 
+// Leases that were lost, by cause. Thread-safe.
+class LossMeter {
+ public:
+  void Count(LossCause cause);  // nothing for kReported
+  void AddTo(MetricsText& text) const;
+
+ private:
+  static constexpr size_t kCauses = static_cast<size_t>(LossCause::kHung) + 1;
+  std::array<std::atomic<uint64_t>, kCauses> lost_{};
+};
+
 class CoordinatorMeter : public CoordinatorApi {
  public:
-  // `coordinator` must outlive this.
-  CoordinatorMeter(CoordinatorApi& coordinator, std::shared_ptr<StageMeter> stages);
+  // `coordinator` must outlive this. `losses` is counted by whoever hears of them
+  // (CoordinatorOptions::log); null: none.
+  CoordinatorMeter(CoordinatorApi& coordinator, std::shared_ptr<StageMeter> stages,
+                   std::shared_ptr<LossMeter> losses = nullptr);
   ~CoordinatorMeter() override;
 
   // What lies beyond the coordinator; none of it is needed.
@@ -93,6 +106,7 @@ class CoordinatorMeter : public CoordinatorApi {
 
   CoordinatorApi& coordinator_;
   const std::shared_ptr<StageMeter> stages_;
+  const std::shared_ptr<LossMeter> losses_;
   std::atomic<uint64_t> leases_{0}, given_back_{0}, failed_{0};
   std::atomic<uint64_t> accepted_{0}, refused_lease_{0}, refused_damaged_{0};
   std::atomic<uint64_t> registered_{0}, submitted_{0}, tile_bytes_{0};

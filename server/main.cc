@@ -14,6 +14,7 @@
 #include "core/base/blob.h"
 #include "core/base/machine.h"
 #include "proto/access.h"
+#include "proto/service_flags.h"
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 #include "server/coordinator.h"
@@ -219,9 +220,9 @@ absl::StatusOr<std::vector<std::unique_ptr<HttpServer>>> StartWeb(
 }
 
 void LogEntry(const CoordinatorLogEntry& entry) {
-  WriteLog(
-      entry.level, entry.text,
-      {.job = entry.job, .tile = entry.tile, .attempt = entry.attempt, .worker = entry.worker});
+  WriteLog(entry.level, entry.text,
+           {.job = entry.job, .tile = entry.tile, .attempt = entry.attempt, .worker = entry.worker},
+           entry.detail);
 }
 
 int Main(int argc, char** argv) {
@@ -229,11 +230,7 @@ int Main(int argc, char** argv) {
   CLI::App app{"farpoint-server: takes jobs, bakes their scenes, hands tiles to workers."};
   DefineFlags(app, flags);
   DefineSecurityFlags(app, flags);
-  try {
-    app.parse(argc, argv);
-  } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : kServiceExitUsage;
-  }
+  if (const std::optional<int> code = ParseServiceFlags(app, kProgram, argc, argv)) return *code;
   if (const absl::Status bad = CheckHostPort("--listen", flags.listen, /*any_port=*/true);
       !bad.ok()) {
     ReportFatal(kProgram, bad);
@@ -282,7 +279,11 @@ int Main(int argc, char** argv) {
   options.lease_time = std::chrono::milliseconds(flags.lease_ms);
   options.speculate_after = std::chrono::milliseconds(flags.speculate_after_ms);
   options.retention = std::chrono::hours(flags.retention_hours);
-  options.log = LogEntry;
+  const auto losses = std::make_shared<LossMeter>();
+  options.log = [losses](const CoordinatorLogEntry& entry) {
+    losses->Count(entry.lost);
+    LogEntry(entry);
+  };
   if (options.heartbeat * 2 > options.silence_time) {
     std::fprintf(stderr,
                  "farpoint-server: --silence-ms is %llu, less than two heartbeats of %llu ms; "
@@ -297,7 +298,7 @@ int Main(int argc, char** argv) {
     return ReportFatal(kProgram, coordinator.status());
   }
   const std::optional<TlsMaterial> tls_material = server_options->tls;
-  CoordinatorMeter meter(**coordinator, stages);
+  CoordinatorMeter meter(**coordinator, stages, losses);
   absl::StatusOr<std::unique_ptr<GrpcServer>> server =
       GrpcServer::Start(meter, flags.listen, *std::move(server_options));
   if (!server.ok()) {
@@ -325,7 +326,12 @@ int Main(int argc, char** argv) {
     if (!watch) continue;
     const std::optional<absl::StatusOr<TlsMaterial>> now = watch->Look(NowUnixS());
     if (!now) continue;
-    const absl::Status renewed = now->ok() ? (*server)->Renew(**now) : now->status();
+    absl::Status renewed = now->ok() ? (*server)->Renew(**now) : now->status();
+    for (const std::unique_ptr<HttpServer>& one : *web) {
+      // One for Prometheus on loopback is in the clear.
+      const absl::Status of_page = now->ok() ? one->Renew(**now) : absl::OkStatus();
+      if (!absl::IsFailedPrecondition(of_page)) renewed.Update(of_page);
+    }
     if (renewed.ok()) {
       WriteLog(LogLevel::kInfo, "the certificate was replaced: new connections see it");
     } else {

@@ -967,8 +967,9 @@ bool TileScheduler::IsPoison(const Job& job, uint32_t index) {
 }
 
 void TileScheduler::Blame(const LeaseGrant& grant, const std::string& cause, Fault fault,
-                          SchedulerNews& news) {
-  LostLease lost{.grant = grant, .reason = cause, .worker_name = NameOfWorker(grant.worker)};
+                          SchedulerNews& news, LossCause loss) {
+  LostLease lost{
+      .grant = grant, .reason = cause, .cause = loss, .worker_name = NameOfWorker(grant.worker)};
   const auto by = workers_.find(grant.worker);
   if (by != workers_.end()) {
     Worker& worker = by->second;
@@ -1079,39 +1080,41 @@ SchedulerNews TileScheduler::Tick() {
     LeaseGrant grant;
     std::string reason;
     Fault fault;
+    LossCause cause;
   };
   std::vector<Expired> expired;
   for (const auto& [id, live] : leases_) {
     if (live.committing) continue;
-    const auto expire = [&, &live = live](std::string reason, Fault fault) {
+    const auto expire = [&, &live = live](std::string reason, Fault fault, LossCause cause) {
       if (!live.progress.at.empty()) reason += "; the work was at " + live.progress.at;
-      expired.push_back({live.grant, std::move(reason), fault});
+      expired.push_back({live.grant, std::move(reason), fault, cause});
     };
     const auto holder = workers_.find(live.grant.worker);
     const std::optional<TimePoint> broke =
         holder == workers_.end() ? std::nullopt : holder->second.disconnected_at;
     if (broke && holder->second.heard <= *broke && now - *broke >= options_.reconnect_time) {
-      expire("the connection to the worker broke", Fault::kVanished);
+      expire("the connection to the worker broke", Fault::kVanished, LossCause::kDisconnected);
     } else if (now - live.heard >= options_.silence_time) {
       expire("nothing was heard of the worker for " + SecondsText(now - live.heard),
-             Fault::kVanished);
+             Fault::kVanished, LossCause::kSilent);
     } else if (now - live.progressed >=
                std::max(options_.lease_time, jobs_.at(live.grant.job).spec.lease_time)) {
-      expire("no progress for " + SecondsText(now - live.progressed), Fault::kReported);
+      expire("no progress for " + SecondsText(now - live.progressed), Fault::kReported,
+             LossCause::kNoProgress);
     } else if (live.progress.rendering && live.heard - live.busy >= options_.stall_time) {
       expire("a render thread hangs: neither progress nor processor time for " +
                  SecondsText(now - live.busy),
-             Fault::kReported);
+             Fault::kReported, LossCause::kHung);
     } else if (GoesInCircles(live)) {
       expire("a render thread computes, but has not got on for " + SecondsText(now - live.stepped),
-             Fault::kReported);
+             Fault::kReported, LossCause::kHung);
     }
   }
   for (const Expired& one : expired) {
     // A tile that was set aside a moment ago took its leases with it.
     if (!leases_.contains(one.grant.lease)) continue;
     EndLease(one.grant.lease);
-    Blame(one.grant, one.reason, one.fault, news);
+    Blame(one.grant, one.reason, one.fault, news, one.cause);
   }
   for (const JobId& id : started_) {
     Job& job = jobs_.at(id);

@@ -56,6 +56,7 @@
 #include "core/base/hash.h"
 #include "core/base/status.h"
 #include "proto/job.h"
+#include "server/loss_cause.h"
 #include "server/time_left.h"
 
 namespace farpoint {
@@ -116,6 +117,7 @@ struct LeaseGrant {
 struct LostLease {
   LeaseGrant grant;
   std::string reason;
+  LossCause cause = LossCause::kReported;
   std::string worker_name;
   bool worker_set_aside = false;  // by this
 };
@@ -376,7 +378,8 @@ class TileScheduler {
   void Heard(const WorkerId& id, Worker& worker);
   void EraseWorker(const WorkerId& id);
   // Blames worker and tile for the loss of a lease, and tells of it; the tile may be set aside.
-  void Blame(const LeaseGrant& grant, const std::string& cause, Fault fault, SchedulerNews& news);
+  void Blame(const LeaseGrant& grant, const std::string& cause, Fault fault, SchedulerNews& news,
+             LossCause loss = LossCause::kReported);
   bool IsPoison(const Job& job, uint32_t tile);
   void Convict(const WorkerId& id, const WorkerHello& hello, AuditVerdict& verdict);
   // After a first result that did not become durable.

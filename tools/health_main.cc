@@ -9,6 +9,7 @@
 
 #include "core/base/blob.h"
 #include "proto/health_probe.h"
+#include "proto/service_flags.h"
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 
@@ -73,11 +74,7 @@ int Main(int argc, char** argv) {
   HealthFlags flags;
   CLI::App app{"farpoint-health: ends with 0 if a coordinator or worker can serve."};
   DefineFlags(app, flags);
-  try {
-    app.parse(argc, argv);
-  } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : kServiceExitUsage;
-  }
+  if (const std::optional<int> code = ParseServiceFlags(app, kProgram, argc, argv)) return *code;
   absl::Status bad = CheckHostPort("ADDRESS", flags.address, /*any_port=*/false);
   if (bad.ok() && flags.metrics && (!flags.tls.empty() || !flags.server_name.empty())) {
     bad = absl::InvalidArgumentError("--metrics: is asked in the clear; leave the TLS flags out");

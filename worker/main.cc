@@ -6,15 +6,19 @@
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <functional>
+#include <mutex>
 #include <optional>
 #include <string>
 #include <thread>
+#include <utility>
 
 #include "core/base/executor.h"
 #include "proto/access.h"
 #include "proto/certificate.h"
 #include "proto/http_server.h"
 #include "proto/metrics_text.h"
+#include "proto/service_flags.h"
 #include "proto/service_main.h"
 #include "proto/tls_files.h"
 #include "worker/blob_cache.h"
@@ -117,10 +121,12 @@ absl::StatusOr<ChannelSecurity> SecurityOf(const WorkerFlags& flags) {
 
 // On loopback open to everybody who is there; else, with TLS, to whoever shows a certificate of the
 // farm. Null if it is not wanted.
+// `authority` is whose certificates count, now.
 absl::StatusOr<std::unique_ptr<HttpServer>> StartMetrics(const WorkerFlags& flags,
                                                          const ChannelSecurity& security,
                                                          const WorkerMeter& meter,
-                                                         const BlobCache& cache) {
+                                                         const BlobCache& cache,
+                                                         std::function<std::string()> authority) {
   if (flags.metrics.empty()) return nullptr;
   HttpServerOptions options;
   options.address = flags.metrics;
@@ -132,33 +138,51 @@ absl::StatusOr<std::unique_ptr<HttpServer>> StartMetrics(const WorkerFlags& flag
       flags.threads != 0 ? flags.threads : std::max(1u, std::thread::hardware_concurrency());
   FP_ASSIGN_OR_RETURN(
       std::unique_ptr<HttpServer> server,
-      HttpServer::Start(
-          options, [&meter, &cache, threads,
-                    ca = secure ? security.tls->ca : std::string()](const HttpRequest& request) {
-            if (!ca.empty()) {
-              const absl::Status known =
-                  request.certificates.empty()
-                      ? absl::UnauthenticatedError("show a certificate of this farm")
-                      : CheckIssued(request.certificates, ca, /*server=*/false, NowUnixS());
-              if (!known.ok()) {
-                return HttpResponse{.status = HttpStatusOf(known),
-                                    .body = std::string(known.message()) + "\n"};
-              }
-            }
-            if (request.path != "/metrics") {
-              return HttpResponse{.status = 404, .body = "only /metrics is here\n"};
-            }
-            return HttpResponse{.content_type = kMetricsContentType,
-                                .body = meter.Metrics(cache.finds(), threads)};
-          }));
+      HttpServer::Start(options, [&meter, &cache, threads, secure,
+                                  authority = std::move(authority)](const HttpRequest& request) {
+        if (secure) {
+          const absl::Status known =
+              request.certificates.empty()
+                  ? absl::UnauthenticatedError("show a certificate of this farm")
+                  : CheckIssued(request.certificates, authority(), /*server=*/false, NowUnixS());
+          if (!known.ok()) {
+            return HttpResponse{.status = HttpStatusOf(known),
+                                .body = std::string(known.message()) + "\n"};
+          }
+        }
+        if (request.path != "/metrics") {
+          return HttpResponse{.status = 404, .body = "only /metrics is here\n"};
+        }
+        return HttpResponse{.content_type = kMetricsContentType,
+                            .body = meter.Metrics(cache.finds(), threads)};
+      }));
   WriteLog(LogLevel::kInfo, std::string("metrics on ") + (secure ? "https://" : "http://") +
                                 flags.metrics.substr(0, flags.metrics.rfind(':')) + ":" +
                                 std::to_string(server->port()) + "/metrics");
   return server;
 }
 
-// If the certificate was replaced, connects anew with it.
-void TakeNewCertificate(TlsWatch& watch, const ChannelSecurity& before, GrpcLink& link) {
+// The farm's authority, which may be replaced while others read it.
+class Authority {
+ public:
+  explicit Authority(std::string pem) : pem_(std::move(pem)) {}
+  void Set(std::string pem) {
+    std::lock_guard lock(mutex_);
+    pem_ = std::move(pem);
+  }
+  std::string Get() const {
+    std::lock_guard lock(mutex_);
+    return pem_;
+  }
+
+ private:
+  mutable std::mutex mutex_;
+  std::string pem_;  // guarded by mutex_
+};
+
+// If the certificate was replaced, connects anew with it, and shows it with the metrics.
+void TakeNewCertificate(TlsWatch& watch, const ChannelSecurity& before, GrpcLink& link,
+                        HttpServer* metrics, Authority& authority) {
   const std::optional<absl::StatusOr<TlsMaterial>> now = watch.Look(NowUnixS());
   if (!now) return;
   if (!now->ok()) {
@@ -169,6 +193,14 @@ void TakeNewCertificate(TlsWatch& watch, const ChannelSecurity& before, GrpcLink
   ChannelSecurity security = before;
   security.tls = **now;
   link.Reconnect(security);
+  authority.Set(security.tls->ca);
+  if (metrics != nullptr) {
+    const absl::Status renewed = metrics->Renew(*security.tls);
+    // On loopback they are in the clear.
+    if (!renewed.ok() && !absl::IsFailedPrecondition(renewed)) {
+      WriteLog(LogLevel::kError, "--metrics: " + std::string(renewed.message()));
+    }
+  }
   WriteLog(LogLevel::kInfo, "the certificate was replaced: connected anew with it");
 }
 
@@ -178,11 +210,7 @@ int Main(int argc, char** argv) {
   flags.name = DefaultName();
   CLI::App app{"farpoint-worker: renders tiles for a farpoint-server."};
   DefineFlags(app, flags);
-  try {
-    app.parse(argc, argv);
-  } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : kServiceExitUsage;
-  }
+  if (const std::optional<int> code = ParseServiceFlags(app, kProgram, argc, argv)) return *code;
   if (flags.cache.empty()) {
     std::fprintf(stderr, "farpoint-worker: there is no home folder; give --cache DIR\n");
     return kServiceExitUsage;
@@ -241,8 +269,9 @@ int Main(int argc, char** argv) {
                       meter);
   if (!cache.ok()) return ReportFatal(kProgram, Annotate(cache.status(), "--cache"));
   const std::unique_ptr<TileRenderer> renderer = MakeCoreRenderer();
+  Authority authority(security->tls ? security->tls->ca : std::string());
   const absl::StatusOr<std::unique_ptr<HttpServer>> metrics =
-      StartMetrics(flags, *security, meter, **cache);
+      StartMetrics(flags, *security, meter, **cache, [&authority] { return authority.Get(); });
   if (!metrics.ok()) return ReportFatal(kProgram, Annotate(metrics.status(), "--metrics"));
   Worker worker(std::move(options), meter, **cache, *renderer);
   WriteLog(LogLevel::kInfo, std::string(kProgram) + " " FARPOINT_VERSION " for " +
@@ -258,7 +287,7 @@ int Main(int argc, char** argv) {
       if (!signals.Wait(std::chrono::milliseconds(100))) {
         if (watch && std::chrono::steady_clock::now() >= next_look) {
           next_look = std::chrono::steady_clock::now() + std::chrono::seconds(1);
-          TakeNewCertificate(*watch, *security, *link);
+          TakeNewCertificate(*watch, *security, *link, metrics->get(), authority);
         }
         continue;
       }

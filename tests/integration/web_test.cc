@@ -8,7 +8,9 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstdlib>
+#include <filesystem>
 #include <fstream>
 #include <map>
 #include <nlohmann/json.hpp>
@@ -18,6 +20,7 @@
 
 #include "tests/integration/certificates.h"
 #include "tests/integration/farm.h"
+#include "tests/integration/process.h"
 
 namespace farpoint {
 namespace {
@@ -116,6 +119,51 @@ void RenderSmallJob(Farm& farm, std::vector<std::string> more = {}) {
   ASSERT_EQ(run.exit_code, 0) << run.err << farm.Logs();
 }
 
+TEST(Web, AWorkerThatIsKilledIsCountedAsGoneAndItsLeaseAsLost) {
+  Farm farm;
+  farm.StartServer({"--metrics", "127.0.0.1:0"});
+  farm.StartWorker();
+  std::vector<std::string> args = kSmallJob;
+  args[1] = SceneFile("cornell.gltf");
+  // A tile that would take hours.
+  args.insert(args.end(), {"--detach", "--paths", "1048576"});
+  ASSERT_EQ(farm.Client(farm.WithCoordinator(args)).exit_code, 0) << farm.Logs();
+  const auto metric = [&](const char* name) {
+    return ParseMetrics(GetText(PortIn(farm, "server0.log", "metrics"), "/metrics")).at(name);
+  };
+  ASSERT_TRUE(WaitUntil(std::chrono::seconds(60), [&] {
+    return metric(R"(farpoint_workers{state="busy"})") == 1;
+  })) << farm.Logs();
+  farm.worker(0).Signal(SIGKILL);
+  EXPECT_TRUE(WaitUntil(std::chrono::seconds(60), [&] {
+    return metric(R"(farpoint_leases_lost_total{cause="disconnected"})") == 1 &&
+           metric(R"(farpoint_workers{state="gone"})") == 1;
+  })) << farm.Logs();
+  EXPECT_EQ(metric("farpoint_worker_threads"), 0);
+}
+
+TEST(Services, NameTheFlagThatIsWrongAndTheNearestOne) {
+  Farm farm;
+  const auto refusal = [&](std::vector<std::string> args) {
+    args[0] = BinFolder() + "/" + args[0];
+    Process process(args, farm.File("x.out"), farm.File("x.err"));
+    EXPECT_EQ(process.Wait(std::chrono::seconds(60)), 2);
+    const std::string text = farm.Read("x.err");
+    std::filesystem::remove(farm.File("x.err"));
+    EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 1) << text;
+    return text;
+  };
+  EXPECT_EQ(refusal({"farpoint-server", "--listn", "h:1", "--store", "s"}),
+            "farpoint-server: --listn: unknown flag; did you mean --listen?\n");
+  EXPECT_THAT(refusal({"farpoint-server", "--stroe", "s"}), HasSubstr("did you mean --store?"));
+  EXPECT_THAT(refusal({"farpoint-server"}), HasSubstr("farpoint-server: --store is required"));
+  EXPECT_THAT(refusal({"farpoint-worker", "--coordinator", "h:1", "left"}),
+              HasSubstr("farpoint-worker: 'left' is one argument too many"));
+  EXPECT_THAT(refusal({"farpoint-worker", "--coordinator", "h:1", "--threads", "many"}),
+              HasSubstr("--threads"));
+  EXPECT_THAT(refusal({"farpoint-health"}), HasSubstr("farpoint-health: ADDRESS is required"));
+}
+
 TEST(Web, MetricsAgreeWithWhatWasRendered) {
   Farm farm;
   farm.StartServer({"--metrics", "127.0.0.1:0", "--audit-fraction", "0"});
@@ -133,6 +181,8 @@ TEST(Web, MetricsAgreeWithWhatWasRendered) {
   EXPECT_EQ(server.at(R"(farpoint_lease_seconds_bucket{le="+Inf"})"), kSmallJobTiles);
   EXPECT_GT(server.at("farpoint_lease_seconds_sum"), 0);
   EXPECT_EQ(SumOf(server, "farpoint_results_refused_total"), 0);
+  EXPECT_EQ(SumOf(server, "farpoint_leases_lost_total"), 0);
+  EXPECT_EQ(server.at(R"(farpoint_workers{state="gone"})"), 0);
   EXPECT_EQ(SumOf(server, "farpoint_workers{"), 1);
   EXPECT_EQ(server.at("farpoint_queue_tiles"), 0);
   EXPECT_GT(server.at("farpoint_scene_received_bytes_total"), 0);

@@ -13,6 +13,7 @@
 #include "proto/grpc_channel.h"
 #include "proto/grpc_status.h"
 #include "server/coordinator.h"
+#include "server/coordinator_meter.h"
 #include "server/grpc_server.h"
 #include "tests/unit/server/fake_render.h"
 #include "tests/unit/server/temp_folder.h"
@@ -368,6 +369,19 @@ TEST_F(ServicesTest, EveryChunkHasItsHash) {
   }
 }
 
+// Tells how often a worker has opened the stream by which its life is seen.
+class CountsStreams final : public CoordinatorMeter {
+ public:
+  explicit CountsStreams(CoordinatorApi& coordinator)
+      : CoordinatorMeter(coordinator, std::make_shared<StageMeter>()) {}
+  absl::StatusOr<uint64_t> Attached(const WorkerId& worker) override {
+    absl::StatusOr<uint64_t> connection = CoordinatorMeter::Attached(worker);
+    if (connection.ok()) ++opened;
+    return connection;
+  }
+  std::atomic<int> opened{0};
+};
+
 TEST_F(ServicesTest, ABrokenConnectionCostsTheLeaseBeforeSilenceDoes) {
   CoordinatorOptions options;
   options.baker = std::make_shared<FakeBaker>();
@@ -375,7 +389,8 @@ TEST_F(ServicesTest, ABrokenConnectionCostsTheLeaseBeforeSilenceDoes) {
   options.reconnect_time = milliseconds(50);
   auto coordinator = Coordinator::Open(std::move(options));
   ASSERT_TRUE(coordinator.ok());
-  auto server = GrpcServer::Start(**coordinator, "127.0.0.1:0");
+  CountsStreams streams(**coordinator);
+  auto server = GrpcServer::Start(streams, "127.0.0.1:0");
   ASSERT_TRUE(server.ok());
   const std::string address = "127.0.0.1:" + std::to_string((*server)->port());
   const Blob blob = Blob::FromString("scene");
@@ -399,7 +414,7 @@ TEST_F(ServicesTest, ABrokenConnectionCostsTheLeaseBeforeSilenceDoes) {
   const auto work = link->Lease(welcome->id, milliseconds(5000));
   ASSERT_TRUE(work.ok() && work->has_value());
   // The stream may open a moment after the lease was given.
-  std::this_thread::sleep_for(milliseconds(300));
+  ASSERT_TRUE(wait_for([&] { return streams.opened.load() == 1; }));
   EXPECT_EQ(status().tiles.leased, 1u);
   link.reset();
   EXPECT_TRUE(wait_for([&] { return status().tiles.leased == 0; }));

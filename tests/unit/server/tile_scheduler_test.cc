@@ -107,6 +107,7 @@ TEST_F(TileSchedulerTest, SilentWorkerLosesItsLease) {
   ASSERT_EQ(news.lost.size(), 1u);
   EXPECT_EQ(news.lost[0].grant.lease, grant->lease);
   EXPECT_THAT(news.lost[0].reason, HasSubstr("nothing was heard"));
+  EXPECT_EQ(news.lost[0].cause, LossCause::kSilent);
   EXPECT_EQ(scheduler_.Reissued({"a"}), 1u);
 
   const auto again = scheduler_.Lease(other);
@@ -149,6 +150,7 @@ TEST_F(TileSchedulerTest, OnlyProgressKeepsALeaseAlive) {
   const SchedulerNews news = scheduler_.Tick();
   ASSERT_EQ(news.lost.size(), 1u);
   EXPECT_THAT(news.lost[0].reason, HasSubstr("no progress"));
+  EXPECT_EQ(news.lost[0].cause, LossCause::kNoProgress);
 }
 
 TEST_F(TileSchedulerTest, AJobMayHaveLongerLeases) {
@@ -290,6 +292,7 @@ TEST_F(TileSchedulerTest, ABrokenConnectionCostsTheLeaseAtOnce) {
   const SchedulerNews news = scheduler_.Tick();
   ASSERT_EQ(news.lost.size(), 1u);
   EXPECT_THAT(news.lost[0].reason, HasSubstr("connection"));
+  EXPECT_EQ(news.lost[0].cause, LossCause::kDisconnected);
   EXPECT_EQ(scheduler_.Lease(other)->tile, grant->tile);
 }
 
@@ -388,6 +391,7 @@ TEST_F(TileSchedulerTest, AThreadThatGoesInCirclesLosesItsTile) {
   ASSERT_EQ(news.lost.size(), 1u);
   EXPECT_EQ(news.lost[0].grant.worker, circles);
   EXPECT_THAT(news.lost[0].reason, HasSubstr("has not got on"));
+  EXPECT_EQ(news.lost[0].cause, LossCause::kHung);
   EXPECT_LE(waited, options_.stall_time + seconds(1));
   for (int i = 0; i < 20; ++i) {
     heartbeats();
@@ -424,6 +428,7 @@ TEST_F(TileSchedulerTest, AThreadThatHangsLosesItsTileLongBeforeASlowOne) {
   ASSERT_EQ(news.lost.size(), 1u);
   EXPECT_EQ(news.lost[0].grant.worker, hung);
   EXPECT_THAT(news.lost[0].reason, HasSubstr("hangs"));
+  EXPECT_EQ(news.lost[0].cause, LossCause::kHung);
   EXPECT_LE(waited, options_.stall_time + seconds(1));
   // Before it renders it may wait for the network or the disk.
   const auto again = scheduler_.Lease(AddWorker("loads"));
