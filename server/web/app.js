@@ -96,10 +96,13 @@ function sync(list, items, key, make, update) {
 
 function showJobs() {
   const active = (job) => !['done', 'failed', 'cancelled'].includes(job.state);
+  // What is in work, what waits, what somebody holds, what has ended; the newest first.
+  const ranks = ['rendering', 'baking', 'queued', 'paused'];
+  const rank = (job) => active(job) ? ranks.indexOf(job.state) : ranks.length;
   const filter = byId('job-filter').value;
   const jobs = overview.jobs.filter((job) => matches(filter, job.id, job.title, job.state, job.owner));
   jobs.reverse();
-  jobs.sort((a, b) => active(b) - active(a));
+  jobs.sort((a, b) => rank(a) - rank(b));
   sync(byId('jobs'), jobs, (job) => job.id, () => {
     const link = element('a', {}, element('span', {className: 'name'}), element('span', {className: 'eta'}),
                          element('progress', {max: 1}), element('span', {className: 'state'}),
