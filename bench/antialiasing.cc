@@ -32,14 +32,15 @@ double Median(std::vector<double> values) {
   return values.size() % 2 == 1 ? values[middle] : 0.5 * (values[middle - 1] + values[middle]);
 }
 
-// Of the pixels that `on` says, relative to the mean of all that hit.
-ErrorFigures Compare(std::span<const Rgb> image, const SampleTruth& truth, bool edges_only) {
+// Of all pixels that hit, or of those that show an edge relative to the mean of all.
+ErrorFigures Compare(std::span<const Rgb> image, const SampleTruth& truth,
+                     const std::array<std::vector<Rgb>, 2>& halves, bool edges_only) {
   std::vector<Rgb> a, t, half[2];
   double mean = 0, part_mean = 0;
   size_t hits = 0;
   for (size_t i = 0; i < image.size(); ++i) {
     if (truth.hit[i] == 0) continue;
-    const Rgb m = truth.Mean(i);
+    const Rgb m = (halves[0][i] + halves[1][i]) * 0.5f;
     const double grey =
         (static_cast<double>(m.x) + static_cast<double>(m.y) + static_cast<double>(m.z)) / 3;
     mean += grey;
@@ -48,7 +49,7 @@ ErrorFigures Compare(std::span<const Rgb> image, const SampleTruth& truth, bool 
     part_mean += grey;
     a.push_back(image[i]);
     t.push_back(m);
-    for (size_t h = 0; h < 2; ++h) half[h].push_back(truth.half[h][i]);
+    for (size_t h = 0; h < 2; ++h) half[h].push_back(halves[h][i]);
   }
   const std::vector<uint8_t> on(a.size(), 1);
   ErrorFigures figures = CompareSparse(a, t, NoiseOfHalves(on, half[0], half[1]));
@@ -138,6 +139,7 @@ class Runner {
     std::vector<std::vector<double>> gather(options_.spp.size()), ratio(options_.spp.size());
     std::vector<std::vector<double>> trace(options_.spp.size()), direct(options_.spp.size());
     std::vector<std::vector<double>> primary(options_.spp.size());
+    std::vector<std::vector<double>> carried(options_.spp.size()), alone(options_.spp.size());
     std::map<uint32_t, Film> films;
     // What a scene's first image makes for all: the surfels' texels. Not measured.
     settings.spp = std::min(4u, options_.spp.back());
@@ -157,6 +159,17 @@ class Runner {
         direct[k].push_back(seconds(Stage::kDirect));
         primary[k].push_back(seconds(Stage::kPrimary));
         if (gather[0].back() > 0) ratio[k].push_back(gather[k].back() / gather[0].back());
+        Film occlusion[2];
+        for (size_t i = 0; i < 2 && options_.occlusion; ++i) {
+          RenderSettings asked = settings;
+          if (i == 1) asked.layers.clear();
+          asked.layers.push_back(Layer::kAmbientOcclusion);
+          FP_ASSIGN_OR_RETURN(RenderedFrame with, RenderByTiles(loaded.frame, asked, executor_));
+          if (gather[k].back() > 0) {
+            (i == 0 ? carried : alone)[k].push_back(GatherSeconds(with.stats) / gather[k].back());
+          }
+          occlusion[i] = std::move(with.film);
+        }
         if (round > 0) continue;
         AntialiasingRow row;
         row.spp = settings.spp;
@@ -166,10 +179,21 @@ class Runner {
         row.gather_rays = rendered.stats.counts["gather_rays"];
         FP_ASSIGN_OR_RETURN(const SampleTruth truth,
                             TraceSampleTruth(loaded.frame, settings, pixels, options_.paths,
-                                             kTruthSeed, executor_));
+                                             kTruthSeed, executor_, options_.occlusion));
         const std::vector<Rgb> image = ValuesAt(rendered.film, Layer::kIrradiance, pixels);
-        row.all = Compare(image, truth, false);
-        row.edges = Compare(image, truth, true);
+        row.all = Compare(image, truth, truth.half, false);
+        row.edges = Compare(image, truth, truth.half, true);
+        const auto grey = [&](const Film& film) {
+          std::vector<Rgb> values;
+          for (const PixelPosition& p : pixels) {
+            values.emplace_back(film.Get(Layer::kAmbientOcclusion, 0, p.x, p.y));
+          }
+          return values;
+        };
+        if (options_.occlusion) {
+          row.carried = Compare(grey(occlusion[0]), truth, truth.occlusion_half, false);
+          row.alone = Compare(grey(occlusion[1]), truth, truth.occlusion_half, false);
+        }
         scene.rows.push_back(std::move(row));
         films.emplace(settings.spp, std::move(rendered.film));
       }
@@ -180,6 +204,8 @@ class Runner {
       scene.rows[k].direct_s = Median(direct[k]);
       scene.rows[k].primary_s = Median(primary[k]);
       scene.rows[k].ratio = Median(ratio[k]);
+      scene.rows[k].carried_ratio = Median(carried[k]);
+      scene.rows[k].alone_ratio = Median(alone[k]);
     }
     if (options_.pictures) FP_RETURN_IF_ERROR(Draw(scene, loaded.frame, settings, films));
     report_.scenes.push_back(std::move(scene));
@@ -288,6 +314,20 @@ std::string AntialiasingTable(const AntialiasingReport& r) {
           row.all.noise, row.edges.rr, row.edges.rr_error, row.edges.pixels);
     }
   }
+  if (r.options.occlusion) {
+    text +=
+        absl::StrFormat("\nambient occlusion\n%-16s%5s %8s %18s %8s %8s %18s %8s %8s\n", "scene",
+                        "spp", "mean", "carried: rr", "bias", "time", "alone: rr", "bias", "time");
+    for (const AntialiasingScene& s : r.scenes) {
+      for (const AntialiasingRow& row : s.rows) {
+        text += absl::StrFormat(
+            "%-16s%5d %8.4f %9.4f ±%7.4f %+8.4f %8.2f %9.4f ±%7.4f %+8.4f %8.2f  (noise %.4f)\n",
+            s.name, row.spp, row.carried.mean, row.carried.rr, row.carried.rr_error,
+            row.carried.bias, row.carried_ratio, row.alone.rr, row.alone.rr_error, row.alone.bias,
+            row.alone_ratio, row.alone.noise);
+      }
+    }
+  }
   for (const LeftOut& out : r.left_out) Append(text, {"left out: ", out.name, ": ", out.why, "\n"});
   return text;
 }
@@ -310,6 +350,10 @@ std::string AntialiasingJson(const AntialiasingReport& r) {
                       {"ratio", row.ratio},
                       {"irradiance", FiguresJson(row.all)},
                       {"irradiance_at_edges", FiguresJson(row.edges)}});
+      if (!r.options.occlusion) continue;
+      rows.back()["occlusion_carried"] = FiguresJson(row.carried);
+      rows.back()["occlusion_alone"] = FiguresJson(row.alone);
+      rows.back()["occlusion_ratio"] = {{"carried", row.carried_ratio}, {"alone", row.alone_ratio}};
     }
     scenes.push_back(
         {{"name", s.name}, {"command", s.command}, {"surfels", s.surfels}, {"rows", rows}});

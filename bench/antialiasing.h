@@ -24,6 +24,7 @@ struct AntialiasingOptions {
   uint64_t seed = 0;
   size_t reference_pixels = 4000;  // about
   uint32_t paths = 8192;           // of the truth, per pixel
+  bool occlusion = false;          // the layer ambient_occlusion, too
   uint32_t repeat = 1;             // rounds; in each all numbers of samples take their turn
   unsigned threads = 0;
   bool quick = false;  // own scenes, 64x48, few paths: that all works, not how well
@@ -44,6 +45,11 @@ struct AntialiasingRow {
   // Of the indirect irradiance, against the truth at the same samples: over all pixels, and over
   // those that show an edge (relative to the same mean).
   ErrorFigures all, edges;
+  // With options.occlusion: of ambient occlusion against rays, as the records for light carry it
+  // and as it comes alone; gather seconds with it over those without, and of it alone over those
+  // without it, medians of the rounds.
+  ErrorFigures carried, alone;
+  double carried_ratio = 0, alone_ratio = 0;
 };
 
 struct AntialiasingScene {

@@ -385,6 +385,8 @@ absl::StatusOr<BenchCommandLine> ParseBenchCommandLine(std::vector<std::string> 
   antialiasing->add_option("--repeat", aa.repeat, "Rounds")
       ->capture_default_str()
       ->check(CLI::Range(1, 1000));
+  antialiasing->add_flag("--occlusion", aa.occlusion,
+                         "Ambient occlusion, too: its error and cost, with light and alone");
   antialiasing->add_flag("!--no-pictures", aa.pictures, "Tables only");
   antialiasing->add_option("--threads", aa.threads, "0: all cores")
       ->capture_default_str()

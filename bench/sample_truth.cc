@@ -6,6 +6,7 @@
 #include <optional>
 
 #include "core/math/sampling.h"
+#include "core/render/ambient_occlusion.h"
 #include "core/render/camera_rays.h"
 #include "core/render/loaded_scene.h"
 #include "core/render/path_tracer.h"
@@ -69,17 +70,20 @@ class Sampler {
 absl::StatusOr<SampleTruth> TraceSampleTruth(const SparseFrame& frame,
                                              const RenderSettings& settings,
                                              std::span<const PixelPosition> pixels, uint32_t paths,
-                                             uint64_t seed, Executor& executor) {
+                                             uint64_t seed, Executor& executor, bool occlusion) {
   FP_RETURN_IF_ERROR(ValidateSettings(settings));
   const Sampler sampler(frame, settings);
   const uint32_t each = std::max(8u, paths / (2 * settings.spp));
   SampleTruth truth;
   truth.hit.assign(pixels.size(), 0);
   for (auto& half : truth.half) half.assign(pixels.size(), Rgb());
+  for (auto& half : truth.occlusion_half) half.assign(occlusion ? pixels.size() : 0, Rgb());
+  const float distance_m = AoDistance(settings, *sampler.scene().scene);
   std::atomic<uint64_t> rays{0};
   executor.ForEach(pixels.size(), 1, [&](size_t i) {
     const PixelPosition& pixel = pixels[i];
     std::array<Vec3d, 2> sum;
+    std::array<double, 2> open{};
     uint32_t hits = 0;
     LightCounters counters;
     uint64_t traced = 0;
@@ -93,12 +97,17 @@ absl::StatusOr<SampleTruth> TraceSampleTruth(const SparseFrame& frame,
         sum[half] += Vec3d(TraceIndirect(*sampler.scene().accel, *sampler.scene().lights, *receiver,
                                          each, settings.bounces, key, counters, traced)
                                .irradiance);
+        if (occlusion) {
+          open[half] += static_cast<double>(TraceAmbientOcclusion(*sampler.scene().accel, *receiver,
+                                                                  distance_m, each, key, traced));
+        }
       }
     }
     rays += traced;
     truth.hit[i] = hits > 0;
     for (size_t half = 0; half < 2 && hits > 0; ++half) {
       truth.half[half][i] = Rgb(sum[half] / static_cast<double>(hits));
+      if (occlusion) truth.occlusion_half[half][i] = Rgb(static_cast<float>(open[half] / hits));
     }
   });
   truth.rays = rays;

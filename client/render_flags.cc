@@ -411,6 +411,19 @@ constexpr RenderFlag kRenderFlags[] = {
        FP_ASSIGN_OR_RETURN(edit.spec.settings.quality, QualityFromName(value));
        return absl::OkStatus();
      }},
+    {"--ao-distance", "METRES", kMethod,
+     "of the layer ambient_occlusion: what lies at least so far away hides nothing; a number above "
+     "0 or inf; default 0: a tenth of the scene's diagonal",
+     [](std::string_view value, JobEdit& edit) {
+       double metres = std::numeric_limits<double>::infinity();
+       if (value != "inf" && (!ParseFinite(value, metres) || metres < 0 ||
+                              metres > std::numeric_limits<float>::max() ||
+                              (metres > 0 && !(static_cast<float>(metres) > 0)))) {
+         return Bad("expected 0, a number of metres above 0, or inf");
+       }
+       edit.spec.settings.ao_distance_m = static_cast<float>(metres);
+       return absl::OkStatus();
+     }},
     {"--cache-error", "A", kMethod,
      "irrcache: a record's reach over the mean distance of what it sees, 0.01..10; default 0: by "
      "--quality",
@@ -538,6 +551,9 @@ class Use {
     return adaptive();
   }
   bool filter() const { return s_.spp > 1; }
+  bool wants(Layer layer) const {
+    return std::find(s_.layers.begin(), s_.layers.end(), layer) != s_.layers.end();
+  }
 
   // The flags that decide the method.
   std::string method() const {
@@ -582,6 +598,8 @@ constexpr UseRule kUseRules[] = {
      "--cache-samples is left to it"},
     {"--cache-error", [](const Use& u) { return u.Is(Integrator::kIrrcache); }, kCaches},
     {"--cache-samples", [](const Use& u) { return u.Is(Integrator::kIrrcache); }, kCaches},
+    {"--ao-distance", [](const Use& u) { return u.wants(Layer::kAmbientOcclusion); },
+     "with --aov ambient_occlusion"},
     {"--epsilon", [](const Use& u) { return u.far_and_near(); },
      "with --integrator fpbgi, --clusters N and buffers filled by cuts"},
 };

@@ -576,6 +576,7 @@ absl::StatusOr<RenderSettings> SettingsFromWire(const v1::RenderSettings& wire,
   if (wire.has_microbuffer_px()) settings.microbuffer = wire.microbuffer_px();
   if (wire.has_clusters()) settings.clusters = wire.clusters();
   if (wire.has_cache_error()) settings.cache_error = wire.cache_error();
+  if (wire.has_ao_distance_m()) settings.ao_distance_m = wire.ao_distance_m();
   if (wire.has_cache_samples()) settings.cache_samples = wire.cache_samples();
   if (wire.has_epsilon()) settings.epsilon = wire.epsilon();
   if (wire.has_normal_weight()) settings.normal_weight = wire.normal_weight();
@@ -674,6 +675,7 @@ v1::RenderSettings ToWire(const RenderSettings& settings) {
   wire.set_microbuffer_px(settings.microbuffer);
   wire.set_clusters(settings.clusters);
   wire.set_cache_error(settings.cache_error);
+  wire.set_ao_distance_m(settings.ao_distance_m);
   wire.set_cache_samples(settings.cache_samples);
   wire.set_epsilon(settings.epsilon);
   wire.set_normal_weight(settings.normal_weight);

@@ -139,6 +139,7 @@ Digest BakeKey(const JobSpec& spec) {
   s.quality = any.quality;
   s.cache_error = any.cache_error;
   s.cache_samples = any.cache_samples;
+  s.ao_distance_m = any.ao_distance_m;
   s.epsilon = any.epsilon;
   s.normal_weight = any.normal_weight;
   s.kmeans_iterations = any.kmeans_iterations;

@@ -29,6 +29,8 @@ constexpr std::array<Names, 3> kDiffuseIndirectChannels = {
 constexpr std::array<Names, 3> kGlossyIndirectChannels = {"glossy_indirect.R", "glossy_indirect.G",
                                                           "glossy_indirect.B"};
 
+constexpr std::array<Names, 1> kAmbientOcclusionChannels = {"ambient_occlusion.Y"};
+
 // What is looked at is stored in half; what is measured or indexed, in float.
 constexpr std::array<LayerInfo, kLayerCount> kLayers = {{
     {Layer::kBeauty, "beauty", kBeautyChannels, true, true},
@@ -46,6 +48,7 @@ constexpr std::array<LayerInfo, kLayerCount> kLayers = {{
     {Layer::kCutSize, "cutsize", kCutSizeChannels, false, false},
     {Layer::kDiffuseIndirect, "diffuse_indirect", kDiffuseIndirectChannels, true, false},
     {Layer::kGlossyIndirect, "glossy_indirect", kGlossyIndirectChannels, true, false},
+    {Layer::kAmbientOcclusion, "ambient_occlusion", kAmbientOcclusionChannels, true, false},
 }};
 
 // Levenshtein distance.

@@ -28,8 +28,11 @@ enum class Layer : uint32_t {
   kCutSize,  // nodes in the receiver's own cut, mean over samples
   kDiffuseIndirect,  // the part of kIndirect that the diffuse base reflects; all of it on Lambert
   kGlossyIndirect,   // the rest: what interfaces of dielectrics and metals reflect
+  // 1/π ∫ V cosθ dω: the part of what a receiver could see from which light of further away than
+  // the settings' distance reaches it; 1: all. Mean over the samples that hit; 0: background.
+  kAmbientOcclusion,
 };
-inline constexpr int kLayerCount = 15;
+inline constexpr int kLayerCount = 16;
 
 struct LayerInfo {
   Layer layer;

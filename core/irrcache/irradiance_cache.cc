@@ -55,10 +55,13 @@ void Accumulate(const GatherRecord& record, const Vec3f& x, const Vec3f& n, Cach
   if (!(w > 0.0f)) return;
   out.weight += w;
   out.irradiance += IrradianceAt(record, x, n) * w;
+  out.unhidden += UnhiddenAt(record, x, n) * w;
 }
 
 void Finish(CachedIrradiance& out) {
-  if (out.weight > 0.0f) out.irradiance = out.irradiance * (1.0f / out.weight);
+  if (!(out.weight > 0.0f)) return;
+  out.irradiance = out.irradiance * (1.0f / out.weight);
+  out.unhidden = out.unhidden * (1.0f / out.weight);
 }
 
 }  // namespace

@@ -59,8 +59,9 @@ struct IrradianceCacheParams {
 float CacheWeight(const GatherRecord& record, const Vec3f& x, const Vec3f& n);
 
 struct CachedIrradiance {
-  Rgb irradiance;    // W/m²; 0 where nothing weighs
-  float weight = 0;  // Σ w
+  Rgb irradiance;      // W/m²; 0 where nothing weighs
+  float unhidden = 0;  // Σ w UnhiddenAt(x, n) / Σ w; 0 if the records do not tell
+  float weight = 0;    // Σ w
 };
 // Σ w E(x, n) / Σ w over all of `records`.
 CachedIrradiance InterpolateAll(std::span<const GatherRecord> records, const Vec3f& x,

@@ -126,9 +126,10 @@ void HemisphereGrid::Centres(float* x, float* y, float* z) const {
   }
 }
 
-HemisphereSamples::HemisphereSamples(const HemisphereGrid& grid)
-    : storage_(size_t{8} * grid.padded(), 0.0f) {
+HemisphereSamples::HemisphereSamples(const HemisphereGrid& grid, bool tells_near)
+    : storage_(size_t{tells_near ? 9u : 8u} * grid.padded(), 0.0f) {
   for (int i = 0; i < 8; ++i) values_[i] = storage_.data() + size_t(i) * grid.padded();
+  values_[8] = tells_near ? storage_.data() + size_t{8} * grid.padded() : nullptr;
 }
 
 Rgb IrradianceAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n) {
@@ -143,21 +144,38 @@ Rgb IrradianceAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n) {
   return out;
 }
 
+float UnhiddenAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n) {
+  const float v = record.unhidden;
+  const float moved = Dot(record.unhidden_gradient, x - record.position);
+  const float turned =
+      Dot(record.unhidden_vector, n - record.normal) + v * (1.0f - Dot(n, record.normal));
+  return std::clamp(v + std::clamp(moved, -0.5f * v, v) + std::clamp(turned, -0.5f * v, v), 0.0f,
+                    kPif);
+}
+
 struct RecordMaker {
+  // kChannels: radiance, what is open, and with five what is unhidden.
+  template <int kChannels>
   static GatherRecord Make(const HemisphereGrid& grid, const HemisphereSamples& samples,
                            const Vec3f& position, const Frame& frame) {
     const uint32_t rings = grid.rings_, sectors = grid.sectors_, stride = grid.stride_;
     const F8 zero = Set8(0.0f), one = Set8(1.0f);
-    F8 sum[4] = {zero, zero, zero, zero}, inverse = zero, seen = zero;
-    F8 vector[4][3];  // by channel and local axis
+    F8 sum[kChannels], inverse = zero, seen = zero;
+    F8 vector[kChannels][3];  // by channel and local axis
+    const float* value[kChannels];
+    for (int c = 0; c < kChannels; ++c) {
+      sum[c] = zero;
+      value[c] = c < 4 ? samples.radiance(c) : samples.unhidden();
+    }
     for (auto& channel : vector) channel[0] = channel[1] = channel[2] = zero;
-    F8 along_t[4] = {zero, zero, zero, zero}, along_b[4] = {zero, zero, zero, zero};  // ∇E
+    F8 along_t[kChannels], along_b[kChannels];  // ∇E
+    for (int c = 0; c < kChannels; ++c) along_t[c] = along_b[c] = zero;
     // A row of neighbours in the ring: the sample of the sector before.
-    AlignedVector<float> before(size_t{5} * stride);
+    AlignedVector<float> before(size_t{kChannels + 1} * stride);
     for (uint32_t j = 0; j < rings; ++j) {
       const size_t row = size_t{j} * stride;
-      for (int c = 0; c < 5; ++c) {
-        const float* values = c < 4 ? samples.radiance(c) : samples.inverse_distance();
+      for (int c = 0; c <= kChannels; ++c) {
+        const float* values = c < kChannels ? value[c] : samples.inverse_distance();
         float* shifted = before.data() + size_t(c) * stride;
         shifted[0] = values[row + sectors - 1];
         std::copy_n(values + row, sectors - 1, shifted + 1);
@@ -179,7 +197,7 @@ struct RecordMaker {
         inverse += Select8(valid, d, zero);
         seen += Select8(valid, one, zero);
         const F8 inverse_cosine = one / Max8(z, Set8(kLeastCosine));
-        const F8 d_before = Load8(before.data() + size_t{4} * stride + k);
+        const F8 d_before = Load8(before.data() + size_t{kChannels} * stride + k);
         const F8 beside =
             Select8((d >= zero) & (d_before >= zero), Max8(d, d_before), zero) * sideways_weight;
         F8 inward = zero;
@@ -190,8 +208,8 @@ struct RecordMaker {
         }
         const F8 cm = Load8(grid.cos_middle_.data() + k), sm = Load8(grid.sin_middle_.data() + k);
         const F8 cb = Load8(grid.cos_border_.data() + k), sb = Load8(grid.sin_border_.data() + k);
-        for (int c = 0; c < 4; ++c) {
-          const F8 l = Load8(samples.radiance(c) + at);
+        for (int c = 0; c < kChannels; ++c) {
+          const F8 l = Load8(value[c] + at);
           sum[c] += l;
           const F8 weighted = l * inverse_cosine;
           vector[c][0] += weighted * x;
@@ -201,7 +219,7 @@ struct RecordMaker {
           along_t[c] -= sideways * sb;
           along_b[c] += sideways * cb;
           if (j > 0) {
-            const F8 outward = (l - Load8(samples.radiance(c) + at - stride)) * inward;
+            const F8 outward = (l - Load8(value[c] + at - stride)) * inward;
             along_t[c] += outward * cm;
             along_b[c] += outward * sm;
           }
@@ -215,13 +233,18 @@ struct RecordMaker {
     const float inverse_sum = Sum8(inverse);
     record.harmonic_distance_m =
         inverse_sum > 0.0f ? Sum8(seen) / inverse_sum : std::numeric_limits<float>::infinity();
-    for (int c = 0; c < 4; ++c) {
+    for (int c = 0; c < kChannels; ++c) {
       const Vec3f gradient = frame.t * Sum8(along_t[c]) + frame.b * Sum8(along_b[c]);
       const Vec3f v =
           frame.ToWorld(Vec3f(Sum8(vector[c][0]), Sum8(vector[c][1]), Sum8(vector[c][2])) * each);
-      (c < 3 ? record.irradiance[c] : record.openness) = Sum8(sum[c]) * each;
-      (c < 3 ? record.gradient[static_cast<size_t>(c)] : record.open_gradient) = gradient;
-      (c < 3 ? record.vector[static_cast<size_t>(c)] : record.open_vector) = v;
+      const size_t channel = static_cast<size_t>(c);
+      (c < 3    ? record.irradiance[c]
+       : c == 3 ? record.openness
+                : record.unhidden) = Sum8(sum[c]) * each;
+      (c < 3    ? record.gradient[channel]
+       : c == 3 ? record.open_gradient
+                : record.unhidden_gradient) = gradient;
+      (c < 3 ? record.vector[channel] : c == 3 ? record.open_vector : record.unhidden_vector) = v;
     }
     return record;
   }
@@ -229,7 +252,8 @@ struct RecordMaker {
 
 GatherRecord MakeGatherRecord(const HemisphereGrid& grid, const HemisphereSamples& samples,
                               const Vec3f& position, const Frame& frame) {
-  return RecordMaker::Make(grid, samples, position, frame);
+  return samples.unhidden() != nullptr ? RecordMaker::Make<5>(grid, samples, position, frame)
+                                       : RecordMaker::Make<4>(grid, samples, position, frame);
 }
 
 GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const HemisphereSamples& samples,
@@ -241,18 +265,19 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
   const double each = kPi / grid.size();
   const auto index = [&](uint32_t j, uint32_t k) { return size_t{j} * grid.stride() + k; };
   const auto radiance = [&](size_t at, int c) {
-    return static_cast<double>(samples.radiance(c)[at]);
+    return static_cast<double>(c < 4 ? samples.radiance(c)[at] : samples.unhidden()[at]);
   };
+  const int channels = samples.unhidden() != nullptr ? 5 : 4;
   // 1 / the distance of the nearer one of two; 0 if one was not seen.
   const auto nearer = [&](size_t a, size_t b) {
     const double x = static_cast<double>(samples.inverse_distance()[a]);
     const double y = static_cast<double>(samples.inverse_distance()[b]);
     return x < 0 || y < 0 ? 0.0 : std::max(x, y);
   };
-  std::array<double, 4> sum = {};
+  std::array<double, 5> sum = {};
   double inverse = 0;
   uint32_t seen = 0;
-  std::array<Vec3d, 4> vector, gradient;
+  std::array<Vec3d, 5> vector, gradient;
   for (uint32_t j = 0; j < rings; ++j) {
     for (uint32_t k = 0; k < sectors; ++k) {
       const size_t at = index(j, k);
@@ -264,9 +289,10 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
                         samples.direction(2)[at]);
       const double cosine =
           std::max(static_cast<double>(kLeastCosine), static_cast<double>(local.z));
-      for (int c = 0; c < 4; ++c) {
-        sum[c] += radiance(at, c);
-        vector[c] += Vec3d(frame.ToWorld(local)) * (radiance(at, c) * each / cosine);
+      for (int c = 0; c < channels; ++c) {
+        const size_t channel = static_cast<size_t>(c);
+        sum[channel] += radiance(at, c);
+        vector[channel] += Vec3d(frame.ToWorld(local)) * (radiance(at, c) * each / cosine);
       }
 
       const double sin2 = static_cast<double>(j) / rings;
@@ -280,9 +306,10 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
           std::sqrt(sin2) * (1 - sin2) * 2 * kPi / sectors * nearer(at, inner);
       const double sector_weight =
           (std::sqrt((j + 1.0) / rings) - std::sqrt(sin2)) * nearer(at, beside);
-      for (int c = 0; c < 4; ++c) {
-        gradient[c] += outward * ((radiance(at, c) - radiance(inner, c)) * ring_weight) +
-                       sideways * ((radiance(at, c) - radiance(beside, c)) * sector_weight);
+      for (int c = 0; c < channels; ++c) {
+        gradient[static_cast<size_t>(c)] +=
+            outward * ((radiance(at, c) - radiance(inner, c)) * ring_weight) +
+            sideways * ((radiance(at, c) - radiance(beside, c)) * sector_weight);
       }
     }
   }
@@ -290,6 +317,9 @@ GatherRecord MakeGatherRecordLiteral(const HemisphereGrid& grid, const Hemispher
   record.openness = static_cast<float>(sum[3] * each);
   record.open_gradient = Vec3f(gradient[3]);
   record.open_vector = Vec3f(vector[3]);
+  record.unhidden = static_cast<float>(sum[4] * each);
+  record.unhidden_gradient = Vec3f(gradient[4]);
+  record.unhidden_vector = Vec3f(vector[4]);
   record.harmonic_distance_m =
       inverse > 0 ? static_cast<float>(seen / inverse) : std::numeric_limits<float>::infinity();
   for (int c = 0; c < 3; ++c) {

@@ -59,7 +59,8 @@ class HemisphereGrid {
 // What was seen in each stratum. Arrays of grid.padded() elements.
 class HemisphereSamples {
  public:
-  explicit HemisphereSamples(const HemisphereGrid& grid);
+  // `tells_near`: whether unhidden() is to be there.
+  explicit HemisphereSamples(const HemisphereGrid& grid, bool tells_near = false);
 
   float* direction(int axis) { return values_[axis]; }  // unit, local frame (z: the normal)
   const float* direction(int axis) const { return values_[axis]; }
@@ -70,10 +71,13 @@ class HemisphereSamples {
   // below the surface (radiance 0).
   float* inverse_distance() { return values_[7]; }
   const float* inverse_distance() const { return values_[7]; }
+  // The part through which nothing is hit within some distance, [0, 1]; null if nobody asked.
+  float* unhidden() { return values_[8]; }
+  const float* unhidden() const { return values_[8]; }
 
  private:
   AlignedVector<float> storage_;
-  float* values_[8];
+  float* values_[9];
 };
 
 struct GatherRecord {
@@ -87,6 +91,10 @@ struct GatherRecord {
   // rest: + openness (1 - n · n_c).
   float openness = 0;
   Vec3f open_gradient, open_vector;
+  // The same with V: nothing is hit within some distance. 0 if nobody asked. What else a record
+  // says does not depend on it.
+  float unhidden = 0;
+  Vec3f unhidden_gradient, unhidden_vector;
   float harmonic_distance_m = 0;  // harmonic mean of the distances; +inf: nothing seen
   float reach_m = 0;              // world radius of influence; set by the caller
 };
@@ -94,6 +102,8 @@ struct GatherRecord {
 // E(x, n), the carried irradiance: each of the two corrections is clamped to [-E/2, E] and the sum
 // to at least 0, by channel.
 Rgb IrradianceAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n);
+// The same of `unhidden`, with what a turn reveals, in [0, π].
+float UnhiddenAt(const GatherRecord& record, const Vec3f& x, const Vec3f& n);
 
 // From samples of the strata of `grid` about `frame.n`. Sets all but reach_m. Sums run in eight
 // lanes in a fixed order. No NaN can arise from finite samples: nothing is divided by but cosines

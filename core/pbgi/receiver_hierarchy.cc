@@ -56,7 +56,8 @@ struct alignas(32) Lanes {
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
                   std::span<float> weight, std::span<BlendSpread> spread,
-                  std::span<std::array<float, 8>> shares, std::span<float> openness) {
+                  std::span<std::array<float, 8>> shares, std::span<float> openness,
+                  std::span<float> unhidden) {
   Lanes lanes;
   const size_t count = receivers.size();
   for (size_t i = 0; i < 8; ++i) {
@@ -122,7 +123,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
   }
   finest = Select8(left > zero, finest, zero);
   F8 sum[3] = {zero, zero, zero}, weights = zero, grey = zero, squares = zero;
-  F8 open = zero, open_squares = zero;
+  F8 open = zero, open_squares = zero, clear = zero;
   for (const Term& term : terms) {
     const GatherRecord& g = records[term.record]->gather;
     F8 w = term.rest - term.away * Max8(Set8(1.0f / g.reach_m), finest);
@@ -151,19 +152,24 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     }
     grey += w * own;
     squares += w * own * own;
-    if (!openness.empty()) {
-      const F8 low = Set8(-0.5f * g.openness), high = Set8(g.openness);
-      const F8 moved = dx * Set8(g.open_gradient.x) + dy * Set8(g.open_gradient.y) +
-                       dz * Set8(g.open_gradient.z);
+    const auto carried = [&](float value, const Vec3f& gradient, const Vec3f& vector) {
+      const F8 low = Set8(-0.5f * value), high = Set8(value);
+      const F8 moved = dx * Set8(gradient.x) + dy * Set8(gradient.y) + dz * Set8(gradient.z);
       // What the turn reveals beyond the record's horizon is as open as the rest: so a sphere under
       // nothing but sky is as bright everywhere.
       const F8 cosine = nx * Set8(g.normal.x) + ny * Set8(g.normal.y) + nz * Set8(g.normal.z);
-      const F8 turn = tx * Set8(g.open_vector.x) + ty * Set8(g.open_vector.y) +
-                      tz * Set8(g.open_vector.z) + Set8(g.openness) * (one - cosine);
-      const F8 at = Set8(g.openness) + Min8(Max8(moved, low), high) + Min8(Max8(turn, low), high);
-      const F8 bounded = Min8(Max8(at, zero), Set8(kPif));
+      const F8 turn = tx * Set8(vector.x) + ty * Set8(vector.y) + tz * Set8(vector.z) +
+                      Set8(value) * (one - cosine);
+      const F8 at = Set8(value) + Min8(Max8(moved, low), high) + Min8(Max8(turn, low), high);
+      return Min8(Max8(at, zero), Set8(kPif));
+    };
+    if (!openness.empty()) {
+      const F8 bounded = carried(g.openness, g.open_gradient, g.open_vector);
       open += w * bounded;
       open_squares += w * bounded * bounded;
+    }
+    if (!unhidden.empty()) {
+      clear += w * carried(g.unhidden, g.unhidden_gradient, g.unhidden_vector);
     }
   }
   for (size_t i = 0; i < count; ++i) {
@@ -171,6 +177,7 @@ void BlendRecords(std::span<const ScreenRecord* const> records,
     const float inverse = weights[i] > 0.0f ? 1.0f / weights[i] : 0.0f;
     irradiance[i] = Rgb(sum[0][i], sum[1][i], sum[2][i]) * inverse;
     if (!openness.empty()) openness[i] = open[i] * inverse;
+    if (!unhidden.empty()) unhidden[i] = clear[i] * inverse;
     if (!spread.empty()) {
       const auto deviation = [&](float sum_of, float squares_of) {
         const float m = sum_of * inverse;
@@ -703,6 +710,7 @@ void ReceiverHierarchy::SetReach(float footprint_m, float most_reach_m,
     const float scale = floor > 0.0f ? std::max(reach, 0.0f) / floor : 0.0f;
     for (Vec3f& slope : g.gradient) slope *= scale;
     g.open_gradient *= scale;
+    g.unhidden_gradient *= scale;
     reach = floor;
   }
   g.reach_m = std::max(reach, std::numeric_limits<float>::min());  // of a camera on a surface

@@ -119,11 +119,12 @@ struct BlendSpread {
 // for where only b is why). What a receiver gets depends on the records that weigh on it and on
 // their order, not on the other receivers. `spread`: none, or how far they disagree. `shares`:
 // none, or for each record its w at each receiver. `openness`: none, or the same blend of the
-// records' openness, at most π.
+// records' openness, at most π. `unhidden`: the same of that.
 void BlendRecords(std::span<const ScreenRecord* const> records,
                   std::span<const ServedReceiver> receivers, std::span<Rgb> irradiance,
                   std::span<float> weight, std::span<BlendSpread> spread = {},
-                  std::span<std::array<float, 8>> shares = {}, std::span<float> openness = {});
+                  std::span<std::array<float, 8>> shares = {}, std::span<float> openness = {},
+                  std::span<float> unhidden = {});
 
 class ReceiverHierarchy {
  public:

@@ -20,6 +20,7 @@
 #include "core/pbgi/receiver_cluster.h"
 #include "core/pbgi/receiver_hierarchy.h"
 #include "core/pbgi/tree_cut.h"
+#include "core/render/ambient_occlusion.h"
 #include "core/render/camera_rays.h"
 #include "core/render/glossy_gatherer.h"
 #include "core/render/glossy_path_tracer.h"
@@ -41,9 +42,11 @@ constexpr float kServed = 0.02f;
 constexpr float kMostSpread = 0.15f, kMostDraftSpread = 0.4f;
 // The same of the sky's light, in parts of it and the indirect light: shadows have edges.
 constexpr float kMostOpenSpread = 0.05f;
+// The same of what is unhidden, in parts of its mean, where records are made for nothing else.
+constexpr float kMostUnhiddenSpread = 0.05f;
 
 // Keys of independent random choices.
-enum : uint64_t { kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4, kKeyGloss = 5 };
+enum : uint64_t { kKeyDirect = 2, kKeyPath = 3, kKeyCluster = 4, kKeyGloss = 5, kKeyOcclusion = 6 };
 
 // Thread-seconds by stage. A stage is measured in clock ticks, which are cheap to read thousands
 // of times; the sum is scaled to the block's processor time at the end.
@@ -96,6 +99,7 @@ struct Sample {
   // irradiance, and radiance, W/(m² sr), in place of albedo E / pi.
   int32_t glossy = -1;
   Rgb diffuse_albedo, direct_l, diffuse_l, glossy_l;
+  float unhidden = 0;  // ∫ V cosθ dω of the ambient occlusion, if it is asked for
 };
 
 // A block's samples, and what they hit.
@@ -195,10 +199,20 @@ class Renderer final : public FrameRenderer {
                       MaxComponent(scene_.scene->sky()) > 0.0f && scene_.tree != nullptr &&
                       scene_.tree->lit();
     if (scene_.scene->has_gloss()) glossy_ = std::make_unique<GlossyGatherer>(scene_, settings_);
+    // Where nobody asks for light, or there is none, records are made for ambient occlusion alone.
+    wants_occlusion_ = wants(Layer::kAmbientOcclusion);
+    if (wants_occlusion_) {
+      ao_distance_m_ = AoDistance(settings_, *scene_.scene);
+      const bool lit = settings_.point_based() ? scene_.tree != nullptr && scene_.tree->lit()
+                                               : scene_.lights->any_light();
+      occlusion_alone_ = !lit || !WantsGather();
+      if (occlusion_alone_) sky_by_records_ = false;
+    }
     if (settings_.integrator == Integrator::kFpbgi ||
         settings_.integrator == Integrator::kIrrcache) {
-      gatherer_ = std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_,
-                                                   sky_by_records_);
+      gatherer_ =
+          std::make_unique<RecordGatherer>(scene_, rays_, settings_, map_, cut_params_,
+                                           sky_by_records_, ao_distance_m_, !occlusion_alone_);
     }
   }
 
@@ -259,6 +273,10 @@ class Renderer final : public FrameRenderer {
           const float all = mean.openness + 3 * mean.irradiance / (sky.x + sky.y + sky.z);
           params.spread_open = kMostOpenSpread * all;
           deviation.openness = noise * all;
+        }
+        if (occlusion_alone_) {
+          params.spread_open = kMostUnhiddenSpread * mean.openness;
+          deviation.openness = noise * mean.openness;
         }
         hierarchy_ = std::make_unique<ReceiverHierarchy>(params, frame_.film.frame(), *gatherer_);
         gatherer_->Refine(deviation, hierarchy_->finest_strata());
@@ -349,7 +367,8 @@ class Renderer final : public FrameRenderer {
   // A receiver whose albedo is black shows no indirect light; it is gathered only if its irradiance
   // or its cluster itself was asked for.
   bool GathersBlack() const {
-    return wants_irradiance_ || wants_cluster_ || (sky_by_records_ && wants_direct_irradiance_);
+    return wants_irradiance_ || wants_cluster_ || wants_occlusion_ ||
+           (sky_by_records_ && wants_direct_irradiance_);
   }
   static bool IsBlack(const Sample& sample) {
     return !(MaxComponent(sample.glossy < 0 ? sample.albedo : sample.diffuse_albedo) > 0.0f);
@@ -386,12 +405,12 @@ class Renderer final : public FrameRenderer {
       Direct(block, samples, receivers, sample_of, wanted, n);
     }
     clock.Charge(Stage::kDirect);
-    if (glossy_ != nullptr) {
+    if (glossy_ != nullptr && (wants_direct_ || wants_indirect_)) {
       ReflectGloss(block, primary, n, stats);
       clock.Charge(Stage::kTrace);
     }
 
-    if (WantsGather() && !receivers.empty()) {
+    if ((WantsGather() || wants_occlusion_) && !receivers.empty()) {
       if (!GathersBlack() && settings_.skips(kSkipBlack)) {
         for (size_t r = 0; r < receivers.size(); ++r) {
           const Sample& sample = samples[sample_of[r]];
@@ -403,7 +422,8 @@ class Renderer final : public FrameRenderer {
         }
       }
       if (settings_.integrator == Integrator::kPt) {
-        TracePaths(block, primary, n);
+        if (WantsGather()) TracePaths(block, primary, n);
+        if (wants_occlusion_) TraceOcclusion(block, samples, receivers, sample_of, wanted, n);
         clock.Charge(Stage::kTrace);
       } else if (settings_.integrator == Integrator::kIrrcache) {
         if (cache != nullptr) {
@@ -568,6 +588,21 @@ class Renderer final : public FrameRenderer {
     Add(counters, n);
   }
 
+  void TraceOcclusion(const PixelRect& block, std::vector<Sample>& samples,
+                      const std::vector<Receiver>& receivers,
+                      const std::vector<uint32_t>& sample_of, const std::vector<uint8_t>& wanted,
+                      Counters& n) const {
+    for (size_t r = 0; r < receivers.size(); ++r) {
+      Pulse();
+      if (!wanted[r]) continue;
+      samples[sample_of[r]].unhidden =
+          kPif * TraceAmbientOcclusion(*scene_.accel, receivers[r], ao_distance_m_, settings_.paths,
+                                       HashKey(PixelKey(block, sample_of[r], kKeyOcclusion),
+                                               sample_of[r] % settings_.spp),
+                                       n.rays);
+    }
+  }
+
   static void Add(const LightCounters& counters, Counters& n) {
     n.rays += counters.rays + counters.needless;
     n.skipped_shadow += counters.skipped_facing_away;
@@ -580,14 +615,17 @@ class Renderer final : public FrameRenderer {
 
   // Without light there is nothing to gather.
   bool NeedsHierarchy() const {
-    return settings_.adaptive() && WantsGather() &&
+    if (!settings_.adaptive()) return false;
+    if (wants_occlusion_) return true;
+    return WantsGather() &&
            (!settings_.skips(kSkipUnlit) || (scene_.tree != nullptr && scene_.tree->lit()));
   }
 
   // Without light there is nothing to cache.
   bool NeedsCache() const {
-    return settings_.integrator == Integrator::kIrrcache && wants_indirect_ &&
-           (!settings_.skips(kSkipUnlit) || scene_.lights->any_light());
+    if (settings_.integrator != Integrator::kIrrcache) return false;
+    if (wants_occlusion_) return true;
+    return wants_indirect_ && (!settings_.skips(kSkipUnlit) || scene_.lights->any_light());
   }
 
   // The cache of the whole frame, made by the first tile that asks; others wait for it. Null:
@@ -636,10 +674,12 @@ class Renderer final : public FrameRenderer {
               HashKey(PixelKey(block, sample_of[r], kKeyCluster), sample_of[r] % settings_.spp)));
           clock.Skip();
           e.irradiance = own.back().irradiance;
+          e.unhidden = own.back().unhidden;
           ++n.own_records;
         }
       }
       sample.indirect_e = e.irradiance;
+      sample.unhidden = e.unhidden;
     }
     stats += gatherer_->TakeStats();
   }
@@ -698,7 +738,7 @@ class Renderer final : public FrameRenderer {
         const size_t count = std::min<size_t>(8, groups[g].size() - at);
         ServedReceiver served[8];
         Rgb e[8];
-        float weight[8], openness[8];
+        float weight[8], openness[8], unhidden[8];
         for (size_t i = 0; i < count; ++i) {
           const uint32_t r = groups[g][at + i];
           const int pixel = static_cast<int>(sample_of[r] / spp);
@@ -707,12 +747,14 @@ class Renderer final : public FrameRenderer {
         }
         if (wants_cluster_) shares.resize(records.size());
         BlendRecords(records, {served, count}, {e, count}, {weight, count}, {}, shares,
-                     {openness, sky_by_records_ ? count : 0});
+                     {openness, sky_by_records_ ? count : 0},
+                     {unhidden, wants_occlusion_ ? count : 0});
         for (size_t i = 0; i < count; ++i) {
           Sample& sample = samples[sample_of[groups[g][at + i]]];
           sample.indirect_e = e[i];
           sample.weight = weight[i];
           if (sky_by_records_) sample.openness = openness[i];
+          if (wants_occlusion_) sample.unhidden = unhidden[i];
           if (!wants_cluster_) continue;
           for (size_t k = 0; k < records.size(); ++k) {
             const float share = shares[k][i];
@@ -776,7 +818,8 @@ class Renderer final : public FrameRenderer {
         const ServedReceiver served{&receivers[r], static_cast<float>(x) + 0.5f,
                                     static_cast<float>(y) + 0.5f};
         BlendRecords(own_list, {&served, 1}, {&sample.indirect_e, 1}, {&sample.weight, 1}, {}, {},
-                     {&sample.openness, size_t{sky_by_records_}});
+                     {&sample.openness, size_t{sky_by_records_}},
+                     {&sample.unhidden, size_t{wants_occlusion_}});
         if (sample.weight >= hierarchy_->params().enough) continue;
         clock.Charge(Stage::kConvolve);
         own.push_back(hierarchy_->MakeOwnRecord(
@@ -787,6 +830,7 @@ class Renderer final : public FrameRenderer {
         own_list.push_back(&own.back());
         sample.indirect_e = own.back().gather.irradiance;
         if (sky_by_records_) sample.openness = own.back().gather.openness;
+        if (wants_occlusion_) sample.unhidden = own.back().gather.unhidden;
         ++n.clusters;
         ++n.sample_records;
       }
@@ -797,7 +841,7 @@ class Renderer final : public FrameRenderer {
               const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
               const std::vector<uint8_t>& wanted, Counters& n, StageClock& clock) const {
     const PointTree& tree = *scene_.tree;
-    if (!tree.lit() && settings_.skips(kSkipUnlit)) {
+    if (!tree.lit() && settings_.skips(kSkipUnlit) && !wants_occlusion_) {
       n.skipped_unlit += receivers.size();
       return;
     }
@@ -855,6 +899,9 @@ class Renderer final : public FrameRenderer {
           Sample& sample = samples[sample_of[r]];
           sample.cluster = static_cast<float>(c);
           sample.indirect_e = IrradianceAt(record, receivers[r].position, receivers[r].normal);
+          if (wants_occlusion_) {
+            sample.unhidden = UnhiddenAt(record, receivers[r].position, receivers[r].normal);
+          }
         }
         continue;
       }
@@ -936,7 +983,7 @@ class Renderer final : public FrameRenderer {
             error;
         Vec3f normal;
         Vec3d position;
-        float depth = 0, cluster = 0, cut_size = 0;
+        float depth = 0, cluster = 0, cut_size = 0, unhidden = 0;
         uint32_t hits = 0;
         for (uint32_t s = 0; s < spp; ++s) {
           const Sample& sample = samples[first + s];
@@ -964,6 +1011,7 @@ class Renderer final : public FrameRenderer {
           depth += sample.depth;
           cluster += sample.cluster;
           cut_size += sample.cut_size;
+          unhidden += sample.unhidden;
         }
         direct *= inverse_spp;
         indirect *= inverse_spp;
@@ -979,7 +1027,8 @@ class Renderer final : public FrameRenderer {
         const Rgb se =
             Rgb(std::sqrt(error.x), std::sqrt(error.y), std::sqrt(error.z)) * inverse_hits;
         const Rgb beauty = direct + indirect + emission;
-        finite = finite && IsFinite(beauty) && IsFinite(irradiance) && IsFinite(direct_irradiance);
+        finite = finite && IsFinite(beauty) && std::isfinite(unhidden) && IsFinite(irradiance) &&
+                 IsFinite(direct_irradiance);
         const Vec3f p(position * static_cast<double>(inverse_hits));
         const float alpha = static_cast<float>(hits) * inverse_spp;
         for (const Layer layer : film.layers()) {
@@ -1036,6 +1085,10 @@ class Renderer final : public FrameRenderer {
             case Layer::kGlossyIndirect:
               set(glossy_indirect);
               break;
+            case Layer::kAmbientOcclusion:
+              // Sums of strata may pass π by their rounding.
+              set1(std::clamp(unhidden * kInvPif * inverse_hits, 0.0f, 1.0f));
+              break;
           }
         }
       }
@@ -1089,6 +1142,9 @@ class Renderer final : public FrameRenderer {
   bool wants_irradiance_, wants_direct_irradiance_, wants_indirect_, wants_direct_;
   bool hide_;            // leave out of cuts what lies behind a filled part of the buffer
   bool sky_by_records_;  // direct light of a constant sky comes from records
+  bool wants_occlusion_ = false;
+  bool occlusion_alone_ = false;  // records bring no light
+  float ao_distance_m_ = 0;       // 0: nobody asks
 };
 
 bool IsRotation(const Camera& c) {

@@ -63,6 +63,7 @@ void HitReader::ReadHits(Rays& rays) {
     // A hit at the origin itself has no distance: as near as the offset that the ray took.
     const float t = std::max(hit.t, offset_m_);
     rays.inverse_distance[i] = 1.0f / t;
+    if (!shades_) continue;
     if (scene_.scene->IsGlossy(hit.triangle)) {
       ++glossy;
       rays.radiance[i] = ShadeGlossy(rays, i);

@@ -24,16 +24,17 @@ class HitReader {
  public:
   // `atlas` null: every hit is shaded. `indirect`: what shaded hits get by further bounces; null:
   // nothing. `near_m`: hits nearer than this are shaded. `light_key` seeds their shadow rays. The
-  // scene must outlive the reader; its bundles must be prepared.
+  // scene must outlive the reader; its bundles must be prepared. `shades` false: all radiance is 0.
   HitReader(const LoadedSceneData& scene, const SurfelAtlas* atlas, const SurfelAtlas* indirect,
-            float near_m, const Receiver& receiver, uint64_t light_key)
+            float near_m, const Receiver& receiver, uint64_t light_key, bool shades = true)
       : scene_(scene),
         atlas_(atlas),
         indirect_(indirect),
         near_m_(near_m),
         origin_(receiver.Leave()),
         offset_m_(receiver.offset_m),
-        light_key_(light_key) {}
+        light_key_(light_key),
+        shades_(shades) {}
 
   // Rays to be read together: up to kRaysTogether.
   struct Rays {
@@ -74,6 +75,7 @@ class HitReader {
   const Vec3f origin_;
   const float offset_m_;
   const uint64_t light_key_;
+  const bool shades_;
 };
 
 }  // namespace farpoint

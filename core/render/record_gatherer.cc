@@ -10,6 +10,7 @@
 #include "core/math/sampling.h"
 #include "core/pbgi/cut_drawer.h"
 #include "core/pbgi/microbuffer.h"
+#include "core/render/ambient_occlusion.h"
 #include "core/render/hit_reader.h"
 
 namespace farpoint {
@@ -91,18 +92,6 @@ std::vector<uint8_t> ExtraRays(const HemisphereGrid& grid, const HemisphereSampl
   return extra;
 }
 
-// x > 0 or 0, rounded down to a quarter of an octave.
-float RoundToQuarter(double x) {
-  if (!(x > 0)) return 0;
-  int octave;
-  const double mantissa = std::frexp(x, &octave);  // in [1/2, 1)
-  double rounded = 0.5;
-  for (const double step : {0.5946035575013605, 0.7071067811865476, 0.8408964152537145}) {
-    if (mantissa >= step) rounded = step;
-  }
-  return static_cast<float>(std::ldexp(rounded, octave));
-}
-
 }  // namespace
 
 Receiver ReceiverOfHit(const RayAccel& accel, const RayHit& hit, const Vec3f& w) {
@@ -122,16 +111,19 @@ Receiver ReceiverOfHit(const RayAccel& accel, const RayHit& hit, const Vec3f& w)
 
 RecordGatherer::RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
                                const RenderSettings& settings, const MicrobufferMap& map,
-                               const CutParams& cut_params, bool sees_sky)
+                               const CutParams& cut_params, bool sees_sky, float ao_distance_m,
+                               bool shades)
     : scene_(scene),
       rays_(rays),
       settings_(settings),
       map_(map),
       cut_params_(cut_params),
-      sees_sky_(sees_sky) {
+      sees_sky_(sees_sky),
+      ao_distance_m_(ao_distance_m),
+      shades_(shades) {
   hide_ = settings.skips(kSkipHidden);
-  if (settings.point_based() && settings.fill_in_force() == Fill::kRays && scene.tree != nullptr &&
-      !scene.tree->empty()) {
+  if (shades && settings.point_based() && settings.fill_in_force() == Fill::kRays &&
+      scene.tree != nullptr && !scene.tree->empty()) {
     atlas_ = &scene.Atlas();
     indirect_ = scene.IndirectAtlas();
     near_m_ = kNearSpacings * atlas_->spacing_m();
@@ -211,17 +203,19 @@ RecordGatherer::Means RecordGatherer::MeanOf(const PixelRect& frame, Executor& e
     ++hits;
   }
   if (hits == 0) return {};
-  return {RoundToQuarter(sum / hits), RoundToQuarter(open_sum / hits)};
+  return {RoundToQuarterOctave(sum / hits), RoundToQuarterOctave(open_sum / hits)};
 }
 
 GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const HemisphereGrid& grid,
                                           uint64_t key) const {
   const double start = ThreadCpuSeconds();
   const Frame frame(receiver.normal);
-  HemisphereSamples samples(grid);
+  const bool tells_near = ao_distance_m_ > 0;
+  HemisphereSamples samples(grid, tells_near);
+  const float most_inverse = tells_near ? 1.0f / ao_distance_m_ : 0.0f;  // of what hides nothing
   const uint64_t directions_key = HashKey(key, kKeyDirections);
   grid.Directions(directions_key, samples.direction(0), samples.direction(1), samples.direction(2));
-  HitReader reader(scene_, atlas_, indirect_, near_m_, receiver, HashKey(key, kKeyLight));
+  HitReader reader(scene_, atlas_, indirect_, near_m_, receiver, HashKey(key, kKeyLight), shades_);
   HitReader::Rays rays;
   // Reads the rays, once again those that bring so much more than the others that one which slipped
   // between two triangles would show, and hands them to `take`.
@@ -242,6 +236,10 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
     for (int c = 0; c < 3; ++c) samples.radiance(c)[at] = rays.radiance[i][c];
     samples.inverse_distance()[at] = rays.inverse_distance[i];
     if (sees_sky_ && rays.inverse_distance[i] == 0) samples.radiance(3)[at] = 1;
+    if (tells_near) {
+      samples.unhidden()[at] = rays.inverse_distance[i] <= most_inverse ? 1.0f : 0.0f;
+      if (!shades_) samples.radiance(3)[at] = samples.unhidden()[at];
+    }
   };
   const auto direction_of = [&](size_t at) {
     return frame.ToWorld(
@@ -292,6 +290,10 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
       for (int c = 0; c < 3; ++c) samples.radiance(c)[at] += rays.radiance[i][c];
       samples.inverse_distance()[at] += rays.inverse_distance[i];
       if (sees_sky_ && rays.inverse_distance[i] == 0) samples.radiance(3)[at] += 1;
+      if (tells_near && rays.inverse_distance[i] <= most_inverse) {
+        samples.unhidden()[at] += 1;
+        if (!shades_) samples.radiance(3)[at] += 1;
+      }
     };
     for (uint32_t ring = 0; ring < grid.rings(); ++ring) {
       for (uint32_t sector = 0; sector < grid.sectors(); ++sector) {
@@ -313,6 +315,7 @@ GatherRecord RecordGatherer::GatherByRays(const Receiver& receiver, const Hemisp
       const float share = 1.0f / static_cast<float>(extra[at] + 1);
       for (int c = 0; c < 4; ++c) samples.radiance(c)[at] *= share;
       samples.inverse_distance()[at] *= share;
+      if (tells_near) samples.unhidden()[at] *= share;
     }
   }
   const GatherRecord record = MakeGatherRecord(grid, samples, receiver.position, frame);

@@ -23,10 +23,13 @@ namespace farpoint {
 class RecordGatherer final : public PlaceSource {
  public:
   // All must outlive the gatherer. `settings.fill` decides the way. `sees_sky`: records by rays
-  // tell their openness.
+  // tell their openness. `ao_distance_m` > 0: and what is unhidden within that distance. `shades`
+  // false: they bring no light, and their openness is what is unhidden, so that records are placed
+  // and refined for its sake.
   RecordGatherer(const LoadedSceneData& scene, const CameraRays& rays,
                  const RenderSettings& settings, const MicrobufferMap& map,
-                 const CutParams& cut_params, bool sees_sky = false);
+                 const CutParams& cut_params, bool sees_sky = false, float ao_distance_m = 0,
+                 bool shades = true);
 
   // What a few hundred receivers of `frame` see, which are gathered here.
   struct Means {
@@ -59,6 +62,8 @@ class RecordGatherer final : public PlaceSource {
   const MicrobufferMap& map_;
   const CutParams& cut_params_;
   const bool sees_sky_;
+  const float ao_distance_m_;  // 0: nobody asks
+  const bool shades_;
   const SurfelAtlas* atlas_ = nullptr;     // null: shade every hit
   const SurfelAtlas* indirect_ = nullptr;  // what shaded hits get by further bounces; null: one
   Means least_share_;                      // of standard deviation, for a ray more; 0: none

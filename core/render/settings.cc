@@ -120,6 +120,10 @@ absl::Status ValidateSettings(const RenderSettings& s) {
   if (s.cache_samples != 0) {
     FP_RETURN_IF_ERROR(CheckRange<uint32_t>("cache-samples", s.cache_samples, 4, 1u << 20));
   }
+  if (!(s.ao_distance_m >= 0.0f)) {
+    return absl::InvalidArgumentError(
+        "ao-distance must be 0 or a positive number of metres, inf included");
+  }
   if (s.tile_px == 0 || s.tile_px % kBlockSize != 0 || s.tile_px > 65536) {
     return absl::InvalidArgumentError("tile is " + std::to_string(s.tile_px) +
                                       "; it must be a multiple of " + std::to_string(kBlockSize) +
@@ -136,6 +140,13 @@ absl::Status ValidateSettings(const RenderSettings& s) {
     }
     if (layer == Layer::kCluster && s.integrator != Integrator::kFpbgi) {
       return absl::InvalidArgumentError("layer 'cluster' needs --integrator fpbgi");
+    }
+    if (layer == Layer::kAmbientOcclusion && s.integrator != Integrator::kPt &&
+        (s.integrator == Integrator::kPbgi || s.integrator == Integrator::kDpbgi ||
+         s.fill_in_force() == Fill::kCut)) {
+      return absl::InvalidArgumentError(
+          "layer 'ambient_occlusion' needs buffers that rays fill, since discs hide what touches "
+          "them; use fpbgi with adaptive clusters or --fill rays, irrcache, or pt");
     }
     if (layer == Layer::kCutSize && !s.point_based()) {
       return absl::InvalidArgumentError("layer 'cutsize' needs a point-based integrator, not " +

@@ -79,6 +79,9 @@ struct RenderSettings {
   float epsilon = 0.2f;                // far: R_cluster < epsilon (d - r); >= 0
   float normal_weight = 1.0f;          // alpha / squared block diagonal (paper §3.1)
   uint32_t kmeans_iterations = 5;      // 0..100
+  // Of the layer ambient_occlusion: what lies at least so far away hides nothing, metres, > 0,
+  // +inf: all hides; 0: by the scene's size (core/render/ambient_occlusion.h).
+  float ao_distance_m = 0.0f;
   uint64_t seed = 0;
   std::vector<Layer> layers = DefaultLayers();
 

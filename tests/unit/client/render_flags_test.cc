@@ -121,6 +121,7 @@ TEST(RenderFlags, SetTheMethod) {
                                   {"--splat", "opaque"},
                                   {"--clusters", "25"},
                                   {"--cache-error", "0.125"},
+                                  {"--ao-distance", "0.75"},
                                   {"--cache-samples", "300"},
                                   {"--epsilon", "0.25"}})
                                .settings;
@@ -133,6 +134,7 @@ TEST(RenderFlags, SetTheMethod) {
   EXPECT_EQ(s.splat, Splat::kOpaque);
   EXPECT_EQ(s.clusters, 25u);
   EXPECT_EQ(s.cache_error, 0.125f);
+  EXPECT_EQ(s.ao_distance_m, 0.75f);
   EXPECT_EQ(s.cache_samples, 300u);
   EXPECT_EQ(s.epsilon, 0.25f);
 }
@@ -267,6 +269,7 @@ INSTANTIATE_TEST_SUITE_P(
     testing::Values(
         BadValue{"--integrator", "pbgii", "did you mean 'pbgi'?"},
         BadValue{"--integrator", "irrcach", "did you mean 'irrcache'?"},
+        BadValue{"--ao-distance", "-1", "inf"}, BadValue{"--ao-distance", "nan", "inf"},
         BadValue{"--cache-error", "0.001", "0.01"}, BadValue{"--cache-error", "x", "0.01"},
         BadValue{"--cache-samples", "-1", "whole number"},
         BadValue{"--cache-samples", "3", "cache-samples"},

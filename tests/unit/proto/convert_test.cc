@@ -33,6 +33,7 @@ JobSpec FullJob() {
   job.settings.epsilon = 0.2f;
   job.settings.cache_error = 0.4f;
   job.settings.cache_samples = 333;
+  job.settings.ao_distance_m = 2.5f;
   job.settings.bounces = 5;
   job.settings.normal_weight = 0.3f;
   job.settings.kmeans_iterations = 6;

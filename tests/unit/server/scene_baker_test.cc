@@ -54,6 +54,7 @@ TEST(BakeKey, IsBlindToCameraFilmAndTiles) {
   job.settings.integrator = Integrator::kPbgi;
   job.settings.spp = 4;
   job.settings.cache_error = 0.4f;
+  job.settings.ao_distance_m = 2.5f;
   job.settings.cache_samples = 333;
   job.settings.tile_px = 32;
   job.settings.layers = {Layer::kBeauty};

@@ -139,7 +139,46 @@ TEST(GatherRecord, EqualsTheLiteralSums) {
     EXPECT_NEAR(a.openness, b.openness, 1e-5) << samples;
     for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.open_gradient[i], b.open_gradient[i], 2e-4);
     for (int i = 0; i < 3; ++i) EXPECT_NEAR(a.open_vector[i], b.open_vector[i], 2e-4);
+    EXPECT_EQ(a.unhidden, 0.0f);
+
+    // What is unhidden is summed alike, and changes nothing else.
+    HemisphereSamples with(grid, true);
+    for (uint32_t at = 0; at < grid.padded(); ++at) {
+      for (int i = 0; i < 3; ++i) with.direction(i)[at] = s.direction(i)[at];
+      for (int c = 0; c < 4; ++c) with.radiance(c)[at] = s.radiance(c)[at];
+      with.inverse_distance()[at] = s.inverse_distance()[at];
+      with.unhidden()[at] = s.radiance(3)[at];
+    }
+    GatherRecord c = MakeGatherRecord(grid, with, {1, 2, 3}, frame);
+    const GatherRecord d = MakeGatherRecordLiteral(grid, with, {1, 2, 3}, frame);
+    EXPECT_EQ(c.unhidden, a.openness);
+    EXPECT_EQ(c.unhidden_gradient, a.open_gradient);
+    EXPECT_EQ(c.unhidden_vector, a.open_vector);
+    EXPECT_EQ(d.unhidden, b.openness);
+    EXPECT_EQ(d.unhidden_gradient, b.open_gradient);
+    EXPECT_EQ(d.unhidden_vector, b.open_vector);
+    EXPECT_EQ(c.irradiance, a.irradiance);
+    EXPECT_EQ(c.gradient, a.gradient);
+    EXPECT_EQ(c.vector, a.vector);
+    EXPECT_EQ(c.openness, a.openness);
+    EXPECT_EQ(c.open_gradient, a.open_gradient);
+    EXPECT_EQ(c.harmonic_distance_m, a.harmonic_distance_m);
   }
+}
+
+TEST(GatherRecord, WhatIsUnhiddenIsCarriedWithinBounds) {
+  GatherRecord r;
+  r.normal = {0, 0, 1};
+  r.unhidden = 2;
+  r.unhidden_gradient = {1, 0, 0};
+  r.unhidden_vector = {0, 0, 2};
+  EXPECT_EQ(UnhiddenAt(r, {}, {0, 0, 1}), 2.0f);
+  EXPECT_NEAR(UnhiddenAt(r, {0.25f, 3, 0}, {0, 0, 1}), 2.25f, 1e-6);
+  EXPECT_NEAR(UnhiddenAt(r, {-5, 0, 0}, {0, 0, 1}), 1.0f, 1e-6);  // by half of it at most
+  EXPECT_NEAR(UnhiddenAt(r, {5, 0, 0}, {0, 0, 1}), kPif, 1e-6);   // never above π
+  EXPECT_NEAR(UnhiddenAt(r, {}, {0, 1, 0}), 2.0f, 1e-6);  // a turn reveals as much as it hides
+  r.unhidden_vector = {0, 1, 2};
+  EXPECT_NEAR(UnhiddenAt(r, {}, Normalize(Vec3f(0, 3, 4))), 2.6f, 1e-5);
 }
 
 TEST(GatherRecord, AConstantSkyGivesPiTimesItsRadianceAndNoGradient) {

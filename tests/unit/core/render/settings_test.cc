@@ -116,6 +116,32 @@ TEST(RenderSettings, TilesAreWholeBlocks) {
   }
 }
 
+TEST(RenderSettings, AmbientOcclusionNeedsRaysAndADistance) {
+  const auto asked = [](Integrator integrator, uint32_t clusters, Fill fill) {
+    return Validated([&](RenderSettings& s) {
+      s.layers = {Layer::kAmbientOcclusion};
+      s.integrator = integrator;
+      s.clusters = clusters;
+      s.fill = fill;
+    });
+  };
+  EXPECT_TRUE(asked(Integrator::kFpbgi, 0, Fill::kAuto).ok());
+  EXPECT_TRUE(asked(Integrator::kFpbgi, 20, Fill::kRays).ok());
+  EXPECT_TRUE(asked(Integrator::kPt, 0, Fill::kAuto).ok());
+  EXPECT_TRUE(asked(Integrator::kIrrcache, 0, Fill::kAuto).ok());
+  for (const absl::Status& refused :
+       {asked(Integrator::kFpbgi, 20, Fill::kAuto), asked(Integrator::kFpbgi, 0, Fill::kCut),
+        asked(Integrator::kPbgi, 0, Fill::kAuto), asked(Integrator::kDpbgi, 0, Fill::kRays)}) {
+    ExpectRefused(refused, {"ambient_occlusion", "--fill rays", "pt"});
+  }
+  for (const float v : {0.0f, 1e-6f, 3.0f, std::numeric_limits<float>::infinity()}) {
+    EXPECT_TRUE(Validated([&](RenderSettings& s) { s.ao_distance_m = v; }).ok()) << v;
+  }
+  for (const float v : {-1.0f, std::numeric_limits<float>::quiet_NaN()}) {
+    ExpectRefused(Validated([&](RenderSettings& s) { s.ao_distance_m = v; }), {"ao-distance"});
+  }
+}
+
 TEST(RenderSettings, UnknownEnumeratorsAreRefused) {
   ExpectRefused(Validated([](RenderSettings& s) { s.integrator = static_cast<Integrator>(5); }),
                 {"integrator", "fpbgi, pbgi, dpbgi, pt or irrcache"});
