@@ -53,6 +53,8 @@ ErrorFigures Compare(std::span<const Rgb> image, const SampleTruth& truth,
   }
   const std::vector<uint8_t> on(a.size(), 1);
   ErrorFigures figures = CompareSparse(a, t, NoiseOfHalves(on, half[0], half[1]));
+  // Below the truth's noise the error of the difference says nothing.
+  if (!(figures.rr > 0)) figures.rr_error = 0;
   if (!edges_only || hits == 0 || !(mean > 0)) return figures;
   const double scale =
       part_mean / static_cast<double>(a.size()) / (mean / static_cast<double>(hits));
