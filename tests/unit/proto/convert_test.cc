@@ -35,6 +35,7 @@ JobSpec FullJob() {
   job.settings.cache_samples = 333;
   job.settings.ao_distance_m = 2.5f;
   job.settings.bounces = 5;
+  job.settings.materials = Materials::kGltf;
   job.settings.normal_weight = 0.3f;
   job.settings.kmeans_iterations = 6;
   job.settings.seed = 0xffffffffffffffffu;

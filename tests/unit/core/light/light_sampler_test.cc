@@ -23,15 +23,18 @@ namespace {
 // A scene with its light; points are given in the world.
 class Lit {
  public:
-  explicit Lit(const Scene& description) {
+  explicit Lit(const Scene& description, bool gloss = false) {
     Executor executor(1);
-    auto prepared = PreparedScene::Prepare(description, executor);
+    PrepareOptions options;
+    options.gloss = gloss;
+    auto prepared = PreparedScene::Prepare(description, executor, options);
     EXPECT_TRUE(prepared.ok()) << prepared.status();
     accel_ = RayAccel::Build(*prepared).value();
     sampler_ = std::make_unique<const LightSampler>(accel_);
   }
 
   const PreparedScene& scene() const { return accel_->scene(); }
+  const RayAccel& accel() const { return *accel_; }
   const LightSampler& sampler() const { return *sampler_; }
   // Whether something lies on the way from p by all but the end of v.
   bool Hides(const Vec3d& p_world, const Vec3f& n, const Vec3d& v) const {
@@ -1225,6 +1228,79 @@ TEST(LightSampler, ScalesExactlyByPowersOfTwo) {
     }
     EXPECT_GT(lit, 100);
   }
+}
+
+// A reflector of 1 keeps what it was told.
+class Told final : public Reflector {
+ public:
+  Rgb Toward(const Vec3f& w, float density_sr) const override {
+    directions.push_back(w);
+    densities.push_back(density_sr);
+    return Rgb(1);
+  }
+  mutable std::vector<Vec3f> directions;
+  mutable std::vector<float> densities;
+};
+
+TEST(Reflected, IsTheIrradianceWhereAllReflectsAlike) {
+  Scene scene = MakeCornellBox();
+  scene.environment.sky = Rgb(0.3f);
+  PunctualLight point;
+  point.position = {2, 3, 1};
+  point.intensity = Rgb(4);
+  scene.lights.push_back(point);
+  const Lit lit(scene, true);
+  const Vec3f up(0, 1, 0);
+  for (const bool refine : {false, true}) {
+    for (const Vec3d& p : {Vec3d(2.7, 0.01, 1.0), Vec3d(3.8, 0.01, 3.0), Vec3d(1, 2, 4)}) {
+      const SurfacePoint at = lit.At(lit.Local(p), up, up);
+      LightCounters a, b;
+      const Told told;
+      const Rgb e = lit.sampler().Irradiance(at, 16, 5, 0, 0, a, refine);
+      const Rgb r = lit.sampler().Reflected(at, told, 16, 5, 0, 0, b, refine);
+      for (int c = 0; c < 3; ++c) EXPECT_NEAR(r[c], e[c], 1e-5f * e[c]);
+      EXPECT_EQ(a.rays, b.rays);
+    }
+  }
+}
+
+// A ray that happens to go where a sample of the lights went finds the density that the sample
+// told.
+TEST(Reflected, TellsTheDensityThatRaysFind) {
+  Scene scene = MakeGlossyCornellBox(0.5f);
+  const Lit lit(scene, true);
+  const Vec3f up(0, 1, 0);
+  const SurfacePoint at = lit.At(lit.Local({1.5, 4.0, 1.0}), up, up);
+  LightCounters counters;
+  const Told told;
+  lit.sampler().Reflected(at, told, 32, 9, 0, 0, counters);
+  ASSERT_GT(told.directions.size(), 16u);
+  size_t found = 0;
+  for (size_t i = 0; i < told.directions.size(); ++i) {
+    const auto hit = lit.accel().Intersect(at.Leave(), told.directions[i]);
+    ASSERT_TRUE(hit);
+    const LightSampler::Seen seen = lit.sampler().EmissionSeen(at, *hit);
+    if (!(MaxComponent(seen.radiance) > 0)) continue;  // at the emitter's edge
+    ++found;
+    EXPECT_EQ(seen.radiance, Rgb(17, 12, 4));
+    EXPECT_NEAR(seen.density_sr, told.densities[i], 1e-4f * told.densities[i]);
+  }
+  EXPECT_GT(found, 16u);
+  // What does not emit is nothing.
+  const auto floor = lit.accel().Intersect(at.p, {0, -1, 0});
+  ASSERT_TRUE(floor);
+  EXPECT_EQ(lit.sampler().EmissionSeen(at, *floor).radiance, Rgb());
+}
+
+TEST(Reflected, SkiesHaveTheDensityOfTheCosine) {
+  Scene scene = MakeGlossyCornellBox(0.5f);
+  scene.environment.sky = {1, 2, 3};
+  const Lit lit(scene, true);
+  const Vec3f up(0, 1, 0), w = Normalize(Vec3f(0, 1, -1));
+  const SurfacePoint at = lit.At({}, up, up);
+  EXPECT_EQ(lit.sampler().EnvironmentSeen(at, w).radiance, Rgb(1, 2, 3));
+  EXPECT_FLOAT_EQ(lit.sampler().EnvironmentSeen(at, w).density_sr, w.y * kInvPif);
+  EXPECT_EQ(lit.sampler().EnvironmentSeen(at, -w).density_sr, 0);
 }
 
 }  // namespace

@@ -46,6 +46,15 @@ class Chooser {
       }
     });
   }
+  double ProbabilityOf(uint32_t place, const Vec3f& p, const Vec3f& n) const {
+    LightTree::Cache cache;
+    return tree_.ProbabilityOf(place, p, n, cache, [&](uint32_t block, LightTree::Weights& w) {
+      for (uint32_t k = 0; k < LightTree::kWidth; ++k) {
+        const uint32_t light = tree_.order()[size_t{block} * LightTree::kWidth + k];
+        w[k] = light == LightTree::kNone ? 0 : WeightOf(light, p, n);
+      }
+    });
+  }
   const LightTree& tree() const { return tree_; }
   const std::vector<LightBounds>& lights() const { return lights_; }
 
@@ -244,6 +253,31 @@ TEST(LightTree, ManyLightsInOnePlaceAndAtThePointAreFinite) {
       if (!choice) continue;
       EXPECT_TRUE(choice->probability > 0 && choice->probability <= 1.0000001);
       EXPECT_GT(chooser.WeightOf(chooser.tree().order()[choice->place], p, kUp), 0);
+    }
+  }
+}
+
+// Of one block, of two levels, of many.
+TEST(LightTree, ProbabilityIsThatOfChoosing) {
+  for (const size_t count : {1, 2, 7, 60, 1000}) {
+    const Chooser chooser(Cloud(count, count), LightTree::Emission::kCone);
+    for (const Vec3f& p : {Vec3f(0.1f, 0, 0.2f), Vec3f(-3, -2, 1)}) {
+      double all = 0;
+      for (uint32_t place = 0; place < chooser.tree().order().size(); ++place) {
+        if (chooser.tree().order()[place] != LightTree::kNone) {
+          all += chooser.ProbabilityOf(place, p, kUp);
+        }
+      }
+      LightTree::Cache cache;
+      uint32_t chosen = 0;
+      for (int i = 0; i < 64; ++i) {
+        double u = (i + 0.5) / 64;
+        const auto choice = chooser.Choose(p, kUp, u, cache);
+        if (!choice) continue;
+        ++chosen;
+        EXPECT_DOUBLE_EQ(chooser.ProbabilityOf(choice->place, p, kUp), choice->probability);
+      }
+      if (chosen == 64) EXPECT_NEAR(all, 1, 1e-9) << count;
     }
   }
 }

@@ -315,6 +315,38 @@ TEST(GltfImporter, ReadsTextureTransforms) {
   EXPECT_THAT(NotesOf(gltf), HasSubstr("TEXCOORD_2"));
 }
 
+TEST(GltfImporter, ReadsGlossOnDemand) {
+  TinyGltf gltf = TriangleGltf();
+  gltf.json["images"] = {{{"uri", "data:image/png;base64," + Base64(MakePng(1, 1, {0, 9, 8, 7}))}}};
+  gltf.json["textures"] = {{{"source", 0}}};
+  Json material;
+  material["pbrMetallicRoughness"] = {{"metallicFactor", 0.5},
+                                      {"roughnessFactor", 0.25},
+                                      {"metallicRoughnessTexture", {{"index", 0}}}};
+  material["normalTexture"] = {{"index", 0}, {"scale", 2}};
+  material["extensions"]["KHR_materials_ior"] = {{"ior", 2}};
+  gltf.json["materials"] = Json::array({material});
+  Primitive(gltf)["material"] = 0;
+  ImportOptions options;
+  options.gloss = true;
+  const Scene scene = ImportOk(gltf, options);
+  const Material& m = scene.materials.at(0);
+  EXPECT_EQ(m.metallic, 0.5f);
+  EXPECT_EQ(m.roughness, 0.25f);
+  EXPECT_NEAR(m.dielectric_f0, 1.0f / 9, 1e-6f);
+  EXPECT_EQ(m.metal_roughness_texture.texture, 0);
+  EXPECT_EQ(m.normal_texture.texture, 0);
+  EXPECT_EQ(m.normal_scale, 2);
+  EXPECT_GT(scene.textures.at(0).encoded.size(), 0u);
+
+  const Scene lambert = ImportOk(gltf);
+  EXPECT_FALSE(lambert.materials.at(0).normal_texture.present());
+  EXPECT_EQ(lambert.textures.at(0).encoded.size(), 0u);
+  ImportedScene imported{lambert, {}, {}};
+  NoteHiddenGloss(imported);
+  EXPECT_THAT(imported.notes, ElementsAre(HasSubstr("1 material is metallic or glossy")));
+}
+
 TEST(GltfImporter, ReadsLightsInBothUnits) {
   TinyGltf gltf = TriangleGltf();
   gltf.json["extensions"]["KHR_lights_punctual"]["lights"] = {

@@ -740,5 +740,107 @@ TEST(PreparedSceneBlob, SurvivesEveryFlippedBit) {
   EXPECT_GT(accepted, 1000u);
 }
 
+// --- Gloss ---
+
+Prepared PrepareGlossy(const Scene& scene) {
+  Executor executor(1);
+  PrepareOptions options;
+  options.gloss = true;
+  auto prepared = PreparedScene::Prepare(scene, executor, options);
+  EXPECT_TRUE(prepared.ok()) << prepared.status();
+  return prepared.ok() ? *prepared : nullptr;
+}
+
+TEST(PreparedGloss, IsThereOnDemandAndWhereThereIsSome) {
+  Scene scene = TriangleScene();
+  scene.meshes[0].material = 0;
+  scene.materials.resize(1);
+  scene.materials[0].base_color = {0.5f, 0.25f, 1};
+  EXPECT_FALSE(PrepareGlossy(scene)->has_gloss());
+  EXPECT_FALSE(PrepareGlossy(scene)->IsGlossy(0));
+  EXPECT_EQ(PrepareGlossy(scene)->Surface(0, 0.2f, 0.2f).albedo, Rgb(0.5f, 0.25f, 1));
+  scene.materials[0].roughness = 0.5f;
+  scene.materials[0].metallic = 0.25f;
+  scene.materials[0].dielectric_f0 = 0.1f;
+  EXPECT_FALSE(PrepareOk(scene)->has_gloss());
+  const Prepared p = PrepareGlossy(scene);
+  ASSERT_TRUE(p->IsGlossy(0));
+  const MicrofacetMaterial m = p->MicrofacetAt(0, 0.2f, 0.2f);
+  EXPECT_EQ(m.base_color, Rgb(0.5f, 0.25f, 1));
+  EXPECT_EQ(m.metallic, 0.25f);
+  EXPECT_EQ(m.roughness, 0.5f);
+  EXPECT_EQ(m.dielectric_f0, 0.1f);
+  EXPECT_EQ(p->Surface(0, 0.2f, 0.2f).albedo, MeanReflectance(m));
+  const auto read = PreparedScene::FromBlob(p->blob());
+  ASSERT_TRUE(read.ok()) << read.status();
+  EXPECT_EQ((*read)->MicrofacetAt(0, 0.2f, 0.2f).metallic, 0.25f);
+}
+
+TEST(PreparedGloss, RefusesWhatIsOutOfRange) {
+  const auto message = [](const auto& change) {
+    Scene scene = TriangleScene();
+    scene.meshes[0].material = 0;
+    scene.materials.resize(1);
+    change(scene.materials[0]);
+    Executor executor(1);
+    PrepareOptions options;
+    options.gloss = true;
+    return std::string(PreparedScene::Prepare(scene, executor, options).status().message());
+  };
+  EXPECT_THAT(message([](Material& m) { m.metallic = 1.5f; }), HasSubstr("metallic or roughness"));
+  EXPECT_THAT(message([](Material& m) { m.roughness = -1; }), HasSubstr("metallic or roughness"));
+  EXPECT_THAT(message([](Material& m) { m.dielectric_f0 = 1; }), HasSubstr("reflectance"));
+  EXPECT_THAT(message([](Material& m) { m.normal_scale = 1e20f; }), HasSubstr("normal scale"));
+  EXPECT_THAT(message([](Material& m) { m.normal_texture.texture = 3; }),
+              HasSubstr("texture 3 does not exist"));
+}
+
+// Green is roughness, blue metallic, both as they stand and not as sRGB.
+TEST(PreparedGloss, TexturesMultiplyMetalAndRoughness) {
+  Scene scene = TexturedScene(1, 1, {255, 51, 204, 255});
+  Material& m = scene.materials[0];
+  m.base_color_texture = {};
+  m.metal_roughness_texture.texture = 0;
+  m.metallic = 0.5f;
+  m.roughness = 1;
+  const MicrofacetMaterial at = PrepareGlossy(scene)->MicrofacetAt(0, 0.3f, 0.3f);
+  EXPECT_FLOAT_EQ(at.roughness, 0.2f);
+  EXPECT_FLOAT_EQ(at.metallic, 0.4f);
+  // Lambert scenes do not decode it.
+  EXPECT_EQ(PrepareOk(scene)->textures().size(), 0u);
+}
+
+// (0.6, 0, 0.8) leans to where u grows, (0, 0.6, 0.8) against v.
+TEST(PreparedGloss, NormalMapsLeanByTheTextureCoordinates) {
+  const auto normal = [](uint8_t x, uint8_t y, uint8_t z, bool mirrored, bool back = false) {
+    Scene scene = TexturedScene(1, 1, {x, y, z, 255});
+    scene.materials[0].base_color_texture = {};
+    scene.materials[0].normal_texture.texture = 0;
+    scene.meshes[0].uv[0] = {{0, 1}, {1, 1}, {0, 0}};  // v falls with y
+    if (mirrored) scene.meshes[0].uv[0] = {{1, 1}, {0, 1}, {1, 0}};
+    if (back) scene.meshes[0].triangles = {{0, 2, 1}};
+    EXPECT_EQ(PrepareOk(scene)->ShadingNormal(0, 0.3f, 0.3f), Vec3f(0, 0, back ? -1 : 1));
+    return PrepareGlossy(scene)->ShadingNormal(0, 0.3f, 0.3f);
+  };
+  const auto near = [](const Vec3f& a, const Vec3f& b) { return Length(a - b) < 0.01f; };
+  EXPECT_TRUE(near(normal(204, 128, 230, false), {0.6f, 0, 0.8f}));
+  EXPECT_TRUE(near(normal(128, 204, 230, false), {0, 0.6f, 0.8f}));
+  EXPECT_TRUE(near(normal(204, 128, 230, true), {-0.6f, 0, 0.8f}));
+  EXPECT_TRUE(near(normal(128, 204, 230, true), {0, 0.6f, 0.8f}));
+  // Seen from its back the relief is the same, with its normals on that side.
+  EXPECT_TRUE(near(normal(204, 128, 230, false, true), {0.6f, 0, -0.8f}));
+  // Never below the surface, and unit.
+  const Vec3f n = normal(255, 128, 0, false);
+  EXPECT_GE(n.z, 0.015f);
+  EXPECT_NEAR(Length(n), 1, 1e-5f);
+}
+
+TEST(PreparedGloss, DegenerateCoordinatesLeaveTheNormal) {
+  Scene scene = TexturedScene(1, 1, {204, 128, 230, 255});
+  scene.materials[0].normal_texture.texture = 0;
+  scene.meshes[0].uv[0] = {{0.5f, 0.5f}, {0.5f, 0.5f}, {0.5f, 0.5f}};
+  EXPECT_EQ(PrepareGlossy(scene)->ShadingNormal(0, 0.3f, 0.3f), Vec3f(0, 0, 1));
+}
+
 }  // namespace
 }  // namespace farpoint
