@@ -7,6 +7,7 @@
 #include "core/base/fp_trap.h"
 #include "core/math/elementary.h"
 #include "core/math/simd8.h"
+#include "core/math/vec8.h"
 
 namespace farpoint {
 
@@ -256,54 +257,64 @@ void RasterizeCut(const PointTree& tree, const CutView& view, std::span<const Cu
   for (const CutNode& node : cut) rasterizer.Draw(node, node.slot < first_inner_slot);
 }
 
+namespace {
+
+// Radiance of the pixels p to p + 7 of `far` seen through `near`; see ConvolveCosine.
+V8 Composite(const Microbuffer& far, const Microbuffer* near, Splat splat, uint32_t p) {
+  const F8 one = Set8(1.0f);
+  F8 r = Load8(far.radiance(0) + p), g = Load8(far.radiance(1) + p), b = Load8(far.radiance(2) + p);
+  if (near != nullptr) {
+    const F8 nr = Load8(near->radiance(0) + p), ng = Load8(near->radiance(1) + p),
+             nb = Load8(near->radiance(2) + p);
+    if (splat == Splat::kOpaque) {
+      const M8 near_wins = Load8(near->depth() + p) < Load8(far.depth() + p);
+      r = Select8(near_wins, nr, r);
+      g = Select8(near_wins, ng, g);
+      b = Select8(near_wins, nb, b);
+    } else {
+      // What is far gets the room that is left, and never more than it had; none behind what is
+      // covered for the most part, as within one buffer.
+      const F8 near_coverage = Load8(near->coverage() + p);
+      const F8 open = Select8(near_coverage > Set8(kFullFrom), Set8(0.0f), one - near_coverage);
+      const F8 far_coverage = Load8(far.coverage() + p);
+      const F8 part = Select8(far_coverage > open, open / Max8(far_coverage, Set8(1e-30f)), one);
+      r = nr + part * r;
+      g = ng + part * g;
+      b = nb + part * b;
+    }
+  }
+  if (splat == Splat::kCoverage) {
+    // A pixel that is covered for the most part is taken for full.
+    F8 c = Load8(far.coverage() + p);
+    if (near != nullptr) {
+      const F8 near_coverage = Load8(near->coverage() + p);
+      c = Select8(near_coverage > Set8(kFullFrom), near_coverage, Min8(one, near_coverage + c));
+    }
+    const F8 fill = Select8(c > Set8(kFullFrom), one / Max8(c, Set8(kFullFrom)), one);
+    r = r * fill;
+    g = g * fill;
+    b = b * fill;
+  }
+  return {r, g, b};
+}
+
+}  // namespace
+
 Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f& n, Splat splat) {
   const MicrobufferMap& map = far.map();
   const Vec3f axis = map.kind() == BufferMap::kCosine ? Vec3f(0, 0, 1) : n;
   const F8 nx = Set8(axis.x), ny = Set8(axis.y), nz = Set8(axis.z);
-  const F8 zero = Set8(0.0f), one = Set8(1.0f);
+  const F8 zero = Set8(0.0f);
   F8 sum_w = zero, sum_r = zero, sum_g = zero, sum_b = zero;
   for (uint32_t p = 0; p < map.padded(); p += 8) {
     const F8 w = Max8(nx * Load8(map.weight(0) + p) + ny * Load8(map.weight(1) + p) +
                           nz * Load8(map.weight(2) + p),
                       zero);
-    F8 r = Load8(far.radiance(0) + p), g = Load8(far.radiance(1) + p),
-       b = Load8(far.radiance(2) + p);
-    if (near != nullptr) {
-      const F8 nr = Load8(near->radiance(0) + p), ng = Load8(near->radiance(1) + p),
-               nb = Load8(near->radiance(2) + p);
-      if (splat == Splat::kOpaque) {
-        const M8 near_wins = Load8(near->depth() + p) < Load8(far.depth() + p);
-        r = Select8(near_wins, nr, r);
-        g = Select8(near_wins, ng, g);
-        b = Select8(near_wins, nb, b);
-      } else {
-        // What is far gets the room that is left, and never more than it had; none behind what is
-        // covered for the most part, as within one buffer.
-        const F8 near_coverage = Load8(near->coverage() + p);
-        const F8 open = Select8(near_coverage > Set8(kFullFrom), Set8(0.0f), one - near_coverage);
-        const F8 far_coverage = Load8(far.coverage() + p);
-        const F8 part = Select8(far_coverage > open, open / Max8(far_coverage, Set8(1e-30f)), one);
-        r = nr + part * r;
-        g = ng + part * g;
-        b = nb + part * b;
-      }
-    }
-    if (splat == Splat::kCoverage) {
-      // A pixel that is covered for the most part is taken for full.
-      F8 c = Load8(far.coverage() + p);
-      if (near != nullptr) {
-        const F8 near_coverage = Load8(near->coverage() + p);
-        c = Select8(near_coverage > Set8(kFullFrom), near_coverage, Min8(one, near_coverage + c));
-      }
-      const F8 fill = Select8(c > Set8(kFullFrom), one / Max8(c, Set8(kFullFrom)), one);
-      r = r * fill;
-      g = g * fill;
-      b = b * fill;
-    }
+    const V8 l = Composite(far, near, splat, p);
     sum_w = sum_w + w;
-    sum_r = sum_r + w * r;
-    sum_g = sum_g + w * g;
-    sum_b = sum_b + w * b;
+    sum_r = sum_r + w * l.x;
+    sum_g = sum_g + w * l.y;
+    sum_b = sum_b + w * l.z;
   }
   const float total = Sum8(sum_w);
   if (!(total > 0.0f)) {
@@ -326,6 +337,24 @@ Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f&
   }
   const float scale = kPif / total;
   return {Sum8(sum_r) * scale, Sum8(sum_g) * scale, Sum8(sum_b) * scale};
+}
+
+Rgb ConvolveLobe(const Microbuffer& far, const Microbuffer* near,
+                 const std::array<const float*, 3>& weight, const Rgb& integral, Splat splat) {
+  const F8 zero = Set8(0.0f);
+  V8 sum(zero, zero, zero), total(zero, zero, zero);
+  for (uint32_t p = 0; p < far.map().padded(); p += 8) {
+    const V8 w(Load8(weight[0] + p), Load8(weight[1] + p), Load8(weight[2] + p));
+    const V8 l = Composite(far, near, splat, p);
+    total = total + w;
+    sum = sum + V8(w.x * l.x, w.y * l.y, w.z * l.z);
+  }
+  const auto channel = [](F8 s, F8 t, float all) {
+    const float whole = Sum8(t);
+    return whole > 0.0f ? Sum8(s) * (all / whole) : 0.0f;
+  };
+  return {channel(sum.x, total.x, integral.x), channel(sum.y, total.y, integral.y),
+          channel(sum.z, total.z, integral.z)};
 }
 
 }  // namespace farpoint

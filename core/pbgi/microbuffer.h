@@ -8,6 +8,7 @@
 // its own centre; the nearest wins.
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <span>
@@ -98,6 +99,12 @@ void RasterizeCut(const PointTree& tree, const CutView& view, std::span<const Cu
 // fixed order. The quotient makes a buffer of constant radiance exact for every normal. A buffer of
 // one pixel gives pi times its radiance.
 Rgb ConvolveCosine(const Microbuffer& far, const Microbuffer* near, const Vec3f& n, Splat splat);
+
+// The same for any lobe: integral Σ w L / Σ w by channel, with the pixels' weights `weight`, arrays
+// of map.padded() finite elements >= 0, the lobe times the cosine over each pixel; 0 where they sum
+// to 0. `integral`: of the whole lobe.
+Rgb ConvolveLobe(const Microbuffer& far, const Microbuffer* near,
+                 const std::array<const float*, 3>& weight, const Rgb& integral, Splat splat);
 
 // The literal, slow versions: oracles of the tests.
 Rgb ConvolveCosineLiteral(const Microbuffer& far, const Microbuffer* near, const Vec3f& n,

@@ -22,6 +22,7 @@
 #include "core/pbgi/tree_cut.h"
 #include "core/render/ambient_occlusion.h"
 #include "core/render/camera_rays.h"
+#include "core/render/glossy_convolution.h"
 #include "core/render/glossy_gatherer.h"
 #include "core/render/glossy_path_tracer.h"
 #include "core/render/glossy_point.h"
@@ -82,7 +83,7 @@ struct Counters {
   uint64_t skipped_horizon = 0, skipped_invisible = 0, skipped_hidden = 0;
   uint64_t skipped_hidden_nodes = 0, skipped_hidden_subtrees = 0;
   uint64_t skipped_environments = 0, skipped_black_hits = 0;
-  uint64_t glossy_receivers = 0, skipped_matte = 0;
+  uint64_t glossy_receivers = 0, lobes_convolved = 0, skipped_matte = 0;
 };
 
 // One image sample: where the primary ray went.
@@ -414,8 +415,10 @@ class Renderer final : public FrameRenderer {
       if (!GathersBlack() && settings_.skips(kSkipBlack)) {
         for (size_t r = 0; r < receivers.size(); ++r) {
           const Sample& sample = samples[sample_of[r]];
-          const bool by_paths = settings_.integrator == Integrator::kPt && sample.glossy >= 0;
-          if (wanted[r] && IsBlack(sample) && !by_paths) {
+          const bool has_more =
+              sample.glossy >= 0 && (settings_.integrator == Integrator::kPt ||
+                                     ByBuffer(glossy[static_cast<size_t>(sample.glossy)]));
+          if (wanted[r] && IsBlack(sample) && !has_more) {
             wanted[r] = 0;
             ++n.skipped_black;
           }
@@ -436,7 +439,7 @@ class Renderer final : public FrameRenderer {
         Blend(*view, block, samples, receivers, sample_of, wanted, n, stats, clock);
         clock.Charge(Stage::kConvolve);
       } else if (gathers) {
-        Gather(block, samples, receivers, sample_of, wanted, n, clock);
+        Gather(block, primary, n, clock);
         if (gatherer_) stats += gatherer_->TakeStats();
       }
     }
@@ -528,7 +531,7 @@ class Renderer final : public FrameRenderer {
     auto& [samples, receivers, sample_of, wanted, glossy] = primary;
     if (!scene_.lights->any_light()) return;
     const uint32_t each = (settings_.light_samples + settings_.spp - 1) / settings_.spp;
-    const bool indirect = wants_indirect_ && settings_.integrator != Integrator::kPt;
+    const bool by_rays = wants_indirect_ && settings_.integrator != Integrator::kPt;
     LightCounters counters;
     for (size_t r = 0; r < receivers.size(); ++r) {
       Pulse();
@@ -542,7 +545,8 @@ class Renderer final : public FrameRenderer {
       const GlossyGatherer::Reflected reflected = glossy_->Reflect(
           receivers[r], glossy[static_cast<size_t>(sample.glossy)],
           HashKey(PixelKey(block, sample_of[r], kKeyGloss), sample_of[r] % settings_.spp), each,
-          wants_direct_, indirect, counters, stats);
+          wants_direct_, by_rays && !ByBuffer(glossy[static_cast<size_t>(sample.glossy)]), counters,
+          stats);
       sample.direct_l = reflected.direct;
       sample.glossy_l = reflected.indirect;
     }
@@ -837,9 +841,16 @@ class Renderer final : public FrameRenderer {
     }
   }
 
-  void Gather(const PixelRect& block, std::vector<Sample>& samples,
-              const std::vector<Receiver>& receivers, const std::vector<uint32_t>& sample_of,
-              const std::vector<uint8_t>& wanted, Counters& n, StageClock& clock) const {
+  // Receivers that have a microbuffer read it where its pixels carry their lobe; else rays do.
+  bool ByBuffer(const GlossyPoint& point) const {
+    if (!settings_.point_based() || settings_.adaptive()) return false;
+    const bool filled_by_rays =
+        settings_.integrator == Integrator::kFpbgi && settings_.fill_in_force() == Fill::kRays;
+    return !filled_by_rays && CarriesLobe(map_, point.brdf().alpha());
+  }
+
+  void Gather(const PixelRect& block, Primary& primary, Counters& n, StageClock& clock) const {
+    auto& [samples, receivers, sample_of, wanted, glossy] = primary;
     const PointTree& tree = *scene_.tree;
     if (!tree.lit() && settings_.skips(kSkipUnlit) && !wants_occlusion_) {
       n.skipped_unlit += receivers.size();
@@ -873,6 +884,7 @@ class Renderer final : public FrameRenderer {
     const bool by_rays =
         settings_.integrator == Integrator::kFpbgi && settings_.fill_in_force() == Fill::kRays;
     Microbuffer far_buffer(map_), near_buffer(map_);
+    GlossyConvolution convolution(map_);
     CutDrawer drawer(tree, map_, cut_params_, settings_.splat, hide_);
     std::vector<CutNode> cut, scratch;
     std::vector<NearNode> near;
@@ -952,6 +964,13 @@ class Renderer final : public FrameRenderer {
         }
         sample.cut_size = static_cast<float>(alone ? shared_nodes : own_nodes);
         sample.indirect_e = ConvolveCosine(far_buffer, own, receivers[r].normal, settings_.splat);
+        if (sample.glossy >= 0) {
+          const GlossyPoint& point = glossy[static_cast<size_t>(sample.glossy)];
+          if (ByBuffer(point)) {
+            sample.glossy_l = convolution.Reflect(far_buffer, own, point, settings_.splat);
+            ++n.lobes_convolved;
+          }
+        }
         clock.Charge(Stage::kConvolve);
       }
     }
@@ -1108,6 +1127,7 @@ class Renderer final : public FrameRenderer {
     stats.counts["clusters_of_samples"] += n.sample_records;
     if (n.glossy_receivers + n.skipped_matte > 0) {
       stats.counts["glossy_receivers"] += n.glossy_receivers;
+      stats.counts["lobes_convolved"] += n.lobes_convolved;
       stats.skipped["matte_receivers"] += n.skipped_matte;
     }
     stats.skipped["blocks_without_receivers"] += n.skipped_no_receivers;

@@ -1,8 +1,7 @@
 #include "core/render/glossy_gatherer.h"
 
-#include <algorithm>
+#include <array>
 
-#include "core/base/clock.h"
 #include "core/math/sampling.h"
 #include "core/render/hit_reader.h"
 
@@ -21,14 +20,17 @@ GlossyGatherer::GlossyGatherer(const LoadedSceneData& scene, const RenderSetting
     indirect_ = scene.IndirectAtlas();
     near_m_ = kNearSpacings * atlas_->spacing_m();
   }
-}
-
-uint32_t GlossyGatherer::RaysOf(float alpha) const {
-  uint32_t most = 256;
-  if (settings_.quality == Quality::kDraft) most = 64;
-  if (settings_.quality == Quality::kFine) most = 1024;
-  (void)alpha;
-  return most;
+  switch (settings.quality) {
+    case Quality::kDraft:
+      count_ = 64;
+      break;
+    case Quality::kNormal:
+      count_ = 256;
+      break;
+    case Quality::kFine:
+      count_ = 1024;
+      break;
+  }
 }
 
 GlossyGatherer::Reflected GlossyGatherer::Reflect(const Receiver& receiver,
@@ -39,7 +41,7 @@ GlossyGatherer::Reflected GlossyGatherer::Reflect(const Receiver& receiver,
   Reflected out;
   const LightSampler& lights = *scene_.lights;
   const bool extended = lights.has_emitters() || lights.has_sky();
-  const uint32_t count = RaysOf(point.brdf().alpha());
+  const uint32_t count = count_;
   const auto n = static_cast<float>(light_samples), m = static_cast<float>(count);
   if (wants_direct) {
     out.direct = lights.Reflected(receiver.surface(), GlossyReflector(point, extended ? m / n : 0),

@@ -5,7 +5,6 @@
 #pragma once
 
 #include <cstdint>
-#include <mutex>
 
 #include "core/base/stats.h"
 #include "core/light/light_sampler.h"
@@ -31,15 +30,13 @@ class GlossyGatherer {
                     uint32_t light_samples, bool wants_direct, bool wants_indirect,
                     LightCounters& counters, Stats& stats) const;
 
-  // Rays of a receiver whose lobe has this α: wide lobes see more.
-  uint32_t RaysOf(float alpha) const;
-
  private:
   const LoadedSceneData& scene_;
   const RenderSettings& settings_;
   const SurfelAtlas* atlas_ = nullptr;     // null: shade every hit
   const SurfelAtlas* indirect_ = nullptr;  // what shaded hits get by further bounces; null: nothing
   float near_m_ = 0;                       // hits nearer than this are shaded afresh
+  uint32_t count_ = 0;                     // rays of a receiver
 };
 
 }  // namespace farpoint
