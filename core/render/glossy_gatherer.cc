@@ -9,6 +9,10 @@ namespace farpoint {
 
 namespace {
 
+// Narrower lobes get twice the rays: what they see, such as a highlight, is seen by few of them. On
+// the glossy Cornell box 512 rays at roughness 0.3 err as 256 do at 0.5.
+constexpr float kNarrowAlpha = 0.2f;
+
 enum : uint64_t { kKeyDirections = 61, kKeyHits = 62, kKeyLights = 63 };
 
 }  // namespace
@@ -41,7 +45,7 @@ GlossyGatherer::Reflected GlossyGatherer::Reflect(const Receiver& receiver,
   Reflected out;
   const LightSampler& lights = *scene_.lights;
   const bool extended = lights.has_emitters() || lights.has_sky();
-  const uint32_t count = count_;
+  const uint32_t count = point.brdf().alpha() < kNarrowAlpha ? 2 * count_ : count_;
   const auto n = static_cast<float>(light_samples), m = static_cast<float>(count);
   if (wants_direct) {
     out.direct = lights.Reflected(receiver.surface(), GlossyReflector(point, extended ? m / n : 0),

@@ -36,7 +36,7 @@ class GlossyGatherer {
   const SurfelAtlas* atlas_ = nullptr;     // null: shade every hit
   const SurfelAtlas* indirect_ = nullptr;  // what shaded hits get by further bounces; null: nothing
   float near_m_ = 0;                       // hits nearer than this are shaded afresh
-  uint32_t count_ = 0;                     // rays of a receiver
+  uint32_t count_ = 0;                     // rays of a receiver with a wide lobe
 };
 
 }  // namespace farpoint
