@@ -362,8 +362,7 @@ constexpr RenderFlag kRenderFlags[] = {
      "shadow rays per receiver, 1..4096; default 32: N for all emitters, N for the sky or map, one "
      "per point or spot light up to max(N, 8) of them, N drawn among more; up to 16 N where some "
      "rays to emitters or sky are blocked and others are not; a surfel takes a quarter of N on "
-     "each "
-     "side",
+     "each side, up to N where emitters are blocked in part",
      [](std::string_view value, JobEdit& edit) {
        return ParseCount(value, edit.spec.settings.light_samples);
      }},

@@ -408,7 +408,7 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
       for (unsigned rest = points[i].active; rest != 0; rest &= rest - 1) {
         const auto k = static_cast<size_t>(std::countr_zero(rest));
         irradiance[i].SetLane(k, Irradiance(points[i].Lane(k), 1, key, points[i].index[k],
-                                            dimension, counters, false, true, needless));
+                                            dimension, counters, {}, true, needless));
       }
     }
     return;
@@ -453,7 +453,7 @@ void LightSampler::IrradianceEach(std::span<const SurfacePoints8> points, uint64
 
 Rgb LightSampler::Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t key,
                              uint32_t first_index, unsigned dimension, LightCounters& counters,
-                             bool refine, bool environment, unsigned needless) const {
+                             Refinement refine, bool environment, unsigned needless) const {
   return Estimate(
       {at.p, at.ng, at.n, at.Leave(), at.offset_m, samples, key, first_index, dimension, needless},
       refine, environment, counters);
@@ -461,25 +461,25 @@ Rgb LightSampler::Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t 
 
 Rgb LightSampler::Reflected(const SurfacePoint& at, const Reflector& reflector, uint32_t samples,
                             uint64_t key, uint32_t first_index, unsigned dimension,
-                            LightCounters& counters, bool refine, bool environment,
+                            LightCounters& counters, Refinement refine, bool environment,
                             unsigned needless) const {
   return Estimate({at.p, at.ng, at.n, at.Leave(), at.offset_m, samples, key, first_index, dimension,
                    needless, &reflector},
                   refine, environment, counters);
 }
 
-Rgb LightSampler::Estimate(const Query& q, bool refine, bool environment,
+Rgb LightSampler::Estimate(const Query& q, const Refinement& refine, bool environment,
                            LightCounters& counters) const {
   const unsigned needless = q.needless;
   Rgb irradiance = FromAllPunctual(q, counters);
   if (!emitters_.empty()) {
-    irradiance += Refined(&LightSampler::FromEmitters, q, refine, counters);
+    irradiance += Refined(&LightSampler::FromEmitters, q, refine.emitters, counters);
   }
   if (!environment) return irradiance;
   if (environment_ != nullptr) {
-    irradiance += Refined(&LightSampler::FromMap, q, refine, counters);
+    irradiance += Refined(&LightSampler::FromMap, q, refine.environment, counters);
   } else if (has_sky_) {
-    irradiance += Refined(&LightSampler::FromSky, q, refine, counters);
+    irradiance += Refined(&LightSampler::FromSky, q, refine.environment, counters);
   } else if ((needless & kNeedlessEnvironment) != 0) {
     // A black one.
     LightCounters black;
@@ -493,8 +493,8 @@ Rgb LightSampler::Estimate(const Query& q, bool refine, bool environment,
 }
 
 Rgb LightSampler::Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const,
-                          const Query& q, bool refine, LightCounters& counters) const {
-  if (!refine || q.samples < kFewestRefined) return (this->*from)(q, counters);
+                          const Query& q, uint32_t times, LightCounters& counters) const {
+  if (times <= 1 || q.samples < kFewestRefined) return (this->*from)(q, counters);
   // Two halves, independent of each other: each decides whether the other one is refined.
   Query half[2] = {q, q};
   Rgb mean[2];
@@ -512,9 +512,9 @@ Rgb LightSampler::Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&
     if (mixed[1 - i]) {
       Query rest = half[i];
       rest.first_index = half[i].samples;
-      rest.samples = (kRefined - 1) * half[i].samples;
-      mean[i] = (mean[i] + (this->*from)(rest, counters) * static_cast<float>(kRefined - 1)) *
-                (1.0f / kRefined);
+      rest.samples = (times - 1) * half[i].samples;
+      mean[i] = (mean[i] + (this->*from)(rest, counters) * static_cast<float>(times - 1)) *
+                (1.0f / static_cast<float>(times));
     }
     sum += mean[i] * (static_cast<float>(half[i].samples) / static_cast<float>(q.samples));
   }

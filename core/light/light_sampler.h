@@ -63,6 +63,11 @@ class Reflector {
   virtual Rgb Toward(const Vec3f& w, float density_sr) const = 0;
 };
 
+// How many times as many shadow rays an estimate takes where some are blocked and others are not.
+struct Refinement {
+  uint32_t emitters = 1, environment = 1;  // 1: none
+};
+
 // Immutable; thread-safe.
 class LightSampler {
  public:
@@ -92,20 +97,20 @@ class LightSampler {
   // `dimension` (0 or 2) is the first of the two Sobol' dimensions used: a caller whose own choices
   // for the same index take dimensions 0 and 1 passes 2, or the two would be correlated.
   // `refine`: for emitters and for the environment, the samples are two independent halves, and
-  // each takes kRefined times as many where some rays of the *other* half are blocked and others
+  // each takes so many times as many where some rays of the *other* half are blocked and others
   // are not. What decides is independent of what it decides about, so this too is unbiased. Not
   // below kFewestRefined samples. Index ranges of one key are then sets of their own.
   // `environment`: false: without what comes from there.
   // `needless`: NeedlessLight; the estimate is the same, bit by bit.
   Rgb Irradiance(const SurfacePoint& at, uint32_t samples, uint64_t key, uint32_t first_index,
-                 unsigned dimension, LightCounters& counters, bool refine = false,
+                 unsigned dimension, LightCounters& counters, Refinement refine = {},
                  bool environment = true, unsigned needless = 0) const;
 
   // The same estimate of ∫ L reflector cosθ dω: the reflected radiance where the reflector is a
   // BRDF [W/(m² sr)].
   Rgb Reflected(const SurfacePoint& at, const Reflector& reflector, uint32_t samples, uint64_t key,
                 uint32_t first_index, unsigned dimension, LightCounters& counters,
-                bool refine = false, bool environment = true, unsigned needless = 0) const;
+                Refinement refine = {}, bool environment = true, unsigned needless = 0) const;
 
   // What a ray finds that somebody else drew, for estimates that combine their rays with these.
   struct Seen {
@@ -117,7 +122,10 @@ class LightSampler {
   // The environment along the unit direction `w`, where nothing is hit.
   Seen EnvironmentSeen(const SurfacePoint& from, const Vec3f& w) const;
 
-  static constexpr uint32_t kRefined = 16, kFewestRefined = 4;
+  static constexpr uint32_t kFewestRefined = 4;
+  // Of what is seen itself; of surfels, which a gather averages, and whose rays to a sky are cheap
+  // only as long as there are few.
+  static constexpr Refinement kOfReceivers = {16, 16}, kOfSurfels = {4, 1};
 
   // Irradiance(at, 1, key, index, dimension, counters) of each active lane, to the same bits,
   // in less than half the time without rays; 0 in the others. `irradiance` is as long as `points`.
@@ -138,12 +146,13 @@ class LightSampler {
     unsigned needless = 0;
     const Reflector* reflector = nullptr;
   };
-  Rgb Estimate(const Query& q, bool refine, bool environment, LightCounters& counters) const;
+  Rgb Estimate(const Query& q, const Refinement& refine, bool environment,
+               LightCounters& counters) const;
   // A ray that cannot matter: counted, or traced for nothing.
   void Skip(const Query& q, const Vec3f& direction, float reach_m, LightCounters& counters) const;
   // Of one of the From… below: its estimate, and in a penumbra a finer one.
   Rgb Refined(Rgb (LightSampler::*from)(const Query&, LightCounters&) const, const Query& q,
-              bool refine, LightCounters& counters) const;
+              uint32_t times, LightCounters& counters) const;
   struct Emitter {
     Vec3f v0, e1, e2;  // a vertex and the two edges from it
     Vec3f normal;      // unit

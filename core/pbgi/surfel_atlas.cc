@@ -17,15 +17,9 @@ namespace farpoint {
 namespace {
 
 constexpr float kSameSurfaceCosine = 0.5f;
-// A point this many spacings off a surfel's plane lies on another surface (or on a strong bend).
-// Sponza, 1 M surfels: bias -1.5 % without this, -0.8 % with 0.1.
-constexpr float kSamePlane = 0.1f;
-// Where surfels within a spacing of a point differ by more than this, none of them stands for it:
-// at the border of a shadow, and under what stands on a surface. What is buried there is never hit,
-// but it is read by what is seen beside it: kitchen, 305,549 surfels: bias -6.2 % without this,
-// +0.9 % with it; Sponza, 1 M: -1.0 % and +0.25 %, rr 0.0635 and 0.0608, 14 % and 20 % of the hits
-// shaded.
-constexpr float kLeastContrast = 0.25f;
+// A point this many spacings off a surfel's plane lies on another surface, such as the paint on a
+// road, the tile on a floor (or on a strong bend). docs/decisions/0034-unbiased-reading.md.
+constexpr float kSamePlane = 0.01f;
 constexpr float kFarthest = 1.5f * 1.5f;  // squared spacings
 
 uint64_t KeyOf(int64_t x, int64_t y, int64_t z) {
@@ -94,9 +88,7 @@ SurfelGrid::SurfelGrid(const PointTree& tree) : tree_(tree) {
     while (end < n && order[end].key == order[i].key) {
       const uint32_t slot = order[end].slot;
       const Surfel s = tree.surfel(slot);
-      const RadianceSides l = tree.radiance_of(slot);
-      entries_[end] = {s.position, slot, s.normal, l.front.x + l.front.y + l.front.z,
-                       l.back.x + l.back.y + l.back.z};
+      entries_[end] = {s.position, slot, s.normal};
       ++end;
     }
     size_t at = Mix64(order[i].key) & (size - 1);
@@ -177,23 +169,15 @@ struct SurfelGrid::Nearest {
 std::optional<Rgb> SurfelGrid::Find(const Vec3f& p, const Vec3f& n, bool front,
                                     Vec3f* where) const {
   Nearest nearest;
-  // Of those within a spacing, of each winding.
-  float darkest[2] = {Nearest::kNone, Nearest::kNone};
-  float brightest[2] = {0, 0};
-  ForEachNear(p, n, [&](const Entry& entry, float d2, int turned) {
-    const float sum = front == (turned == 0) ? entry.front : entry.back;
-    if (d2 < spacing_m_ * spacing_m_) {
-      darkest[turned] = std::min(darkest[turned], sum);
-      brightest[turned] = std::max(brightest[turned], sum);
-    }
-    nearest.See(entry, d2, turned);
-  });
+  ForEachNear(p, n,
+              [&](const Entry& entry, float d2, int turned) { nearest.See(entry, d2, turned); });
   const Entry* const found = nearest.found();
   if (found == nullptr) return std::nullopt;
-  const int turned = nearest.turned();
   if (where != nullptr) *where = found->position;
-  if (darkest[turned] < kLeastContrast * brightest[turned]) return std::nullopt;
-  return tree_.radiance_of(found->slot, front == (turned == 0));
+  const bool found_front = front == (nearest.turned() == 0);
+  const unsigned side = found_front ? kFrontVisible : kBackVisible;
+  if ((tree_.visible_sides(found->slot) & side) == 0) return std::nullopt;
+  return tree_.radiance_of(found->slot, found_front);
 }
 
 std::optional<SurfelGrid::Side> SurfelGrid::FindVisible(const Vec3f& p, const Vec3f& n, bool front,

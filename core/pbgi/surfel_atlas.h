@@ -24,10 +24,11 @@ class SurfelGrid {
   explicit SurfelGrid(const PointTree& tree);
 
   // The radiance [W/(m² sr)] on the front (`n`, unit) or back of a surface at `p`: that of the
-  // nearest surfel within 1.5 spacings whose plane is within 60° of n's and passes within a tenth
-  // of a spacing of p, of those that look along n if there are any, else of those that look
-  // against it; none if there is none, and where those within one spacing differ more than
-  // fourfold.
+  // nearest surfel within 1.5 spacings whose plane is within 60° of n's and passes within a
+  // hundredth of a spacing of p, of those that look along n if there are any, else of those that
+  // look against it. None if there is none, and where its side is not visible: something stands on
+  // it, and p is not under that. What decides must not be the radiance itself: that is noisy, and a
+  // choice by it is a bias.
   // `where`: none, or gets the surfel's position.
   std::optional<Rgb> Find(const Vec3f& p, const Vec3f& n, bool front, Vec3f* where = nullptr) const;
 
@@ -49,7 +50,6 @@ class SurfelGrid {
     Vec3f position;
     uint32_t slot;
     Vec3f normal;
-    float front, back;  // the sum of the radiance's channels
   };
   struct Cell {
     uint64_t key = kEmpty;

@@ -138,8 +138,9 @@ SurfelShading ShadeSurfels(const SurfelCloud& cloud, const SurfelSides& open_sid
           continue;
         }
         const SurfacePoint at{p, ng, ns, accel.SurfaceOffsetM(t, p, ng)};
-        const Rgb e = lights.Irradiance(at, samples, side_key, 0, 0, light_counters,
-                                        /*refine=*/false, /*environment=*/true, options.needless);
+        const Rgb e =
+            lights.Irradiance(at, samples, side_key, 0, 0, light_counters, LightSampler::kOfSurfels,
+                              /*environment=*/true, options.needless);
         if (!open) {
           if (!(MaxComponent(e) > 0.0f)) {
             ++counts.inside;

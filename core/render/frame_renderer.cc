@@ -519,8 +519,8 @@ class Renderer final : public FrameRenderer {
       }
       sample.direct_e = scene_.lights->Irradiance(
           receivers[r].surface(), each, PixelKey(block, sample_of[r], kKeyDirect),
-          (sample_of[r] % settings_.spp) * each, 0, counters, true, !sky_by_records_,
-          NeedlessLightOf(settings_));
+          (sample_of[r] % settings_.spp) * each, 0, counters, LightSampler::kOfReceivers,
+          !sky_by_records_, NeedlessLightOf(settings_));
     }
     Add(counters, n);
   }

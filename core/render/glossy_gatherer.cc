@@ -49,8 +49,8 @@ GlossyGatherer::Reflected GlossyGatherer::Reflect(const Receiver& receiver,
   const auto n = static_cast<float>(light_samples), m = static_cast<float>(count);
   if (wants_direct) {
     out.direct = lights.Reflected(receiver.surface(), GlossyReflector(point, extended ? m / n : 0),
-                                  light_samples, HashKey(key, kKeyLights), 0, 0, counters, true,
-                                  true, NeedlessLightOf(settings_));
+                                  light_samples, HashKey(key, kKeyLights), 0, 0, counters,
+                                  LightSampler::kOfReceivers, true, NeedlessLightOf(settings_));
   }
   if (!wants_indirect && !(wants_direct && extended)) return out;
   HitReader reader(scene_, atlas_, indirect_, near_m_, receiver, HashKey(key, kKeyHits));

@@ -83,8 +83,8 @@ class Paths {
     }
     at.offset_m = accel_.SurfaceOffsetM(hit->triangle, at.p, at.ng);
     sum += throughput *
-           lights_.Irradiance(at, 1, LightKey(bounce), IndexOf(i, bounce), 2, counters_, false,
-                              true, needless_) *
+           lights_.Irradiance(at, 1, LightKey(bounce), IndexOf(i, bounce), 2, counters_, {}, true,
+                              needless_) *
            kInvPif;
     if (last) return false;
     const Draw d = DrawOf(i, bounce);
@@ -100,7 +100,7 @@ class Paths {
     const bool extended = lights_.has_emitters() || lights_.has_sky();
     const Both reflector(point, extended);
     sum += throughput * lights_.Reflected(point.surface(), reflector, 1, LightKey(bounce),
-                                          IndexOf(i, bounce), 2, counters_, false, true, needless_);
+                                          IndexOf(i, bounce), 2, counters_, {}, true, needless_);
     if (last && !extended) return false;
     const Draw d = DrawOf(i, bounce);
     const Vec3f local = point.brdf().Sample(d.u, d.v);

@@ -1004,7 +1004,8 @@ TEST(LightSampler, RefinesPenumbrasOnly) {
   const auto estimate = [&](double x, bool refine, uint64_t key, LightCounters& counters) {
     return static_cast<double>(lit.sampler()
                                    .Irradiance(lit.At(lit.Local({x, 0, 0}), {0, 0, 1}, {0, 0, 1}),
-                                               8, key, 0, 0, counters, refine)
+                                               8, key, 0, 0, counters,
+                                               refine ? LightSampler::kOfReceivers : Refinement{})
                                    .x);
   };
   for (const double x : {-3.0, 3.0}) {  // all of the panel is seen, none of it
@@ -1020,7 +1021,7 @@ TEST(LightSampler, RefinesPenumbrasOnly) {
     refined.Add(estimate(0.2, true, key, many));
   }
   EXPECT_GT(many.rays, 3.2 * static_cast<double>(few.rays));
-  EXPECT_LE(many.rays, LightSampler::kRefined * few.rays);
+  EXPECT_LE(many.rays, LightSampler::kOfReceivers.emitters * few.rays);
   EXPECT_LT(refined.variance(), 0.5 * plain.variance());
 }
 
@@ -1042,7 +1043,8 @@ TEST(LightSampler, RefiningIsUnbiasedWhateverTheShareThatIsSeen) {
     const auto estimate = [&](uint32_t samples, uint64_t key, bool refine) {
       return static_cast<double>(lit.sampler()
                                      .Irradiance(lit.At(lit.Local({0, 0, 0}), {0, 0, 1}, {0, 0, 1}),
-                                                 samples, key, 0, 0, counters, refine)
+                                                 samples, key, 0, 0, counters,
+                                                 refine ? LightSampler::kOfReceivers : Refinement{})
                                      .x);
     };
     const double truth = estimate(1 << 16, 99, false);
@@ -1256,8 +1258,10 @@ TEST(Reflected, IsTheIrradianceWhereAllReflectsAlike) {
       const SurfacePoint at = lit.At(lit.Local(p), up, up);
       LightCounters a, b;
       const Told told;
-      const Rgb e = lit.sampler().Irradiance(at, 16, 5, 0, 0, a, refine);
-      const Rgb r = lit.sampler().Reflected(at, told, 16, 5, 0, 0, b, refine);
+      const Rgb e = lit.sampler().Irradiance(at, 16, 5, 0, 0, a,
+                                             refine ? LightSampler::kOfReceivers : Refinement{});
+      const Rgb r = lit.sampler().Reflected(at, told, 16, 5, 0, 0, b,
+                                            refine ? LightSampler::kOfReceivers : Refinement{});
       for (int c = 0; c < 3; ++c) EXPECT_NEAR(r[c], e[c], 1e-5f * e[c]);
       EXPECT_EQ(a.rays, b.rays);
     }
