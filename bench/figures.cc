@@ -548,6 +548,55 @@ absl::Status DrawParameters(const FiguresOptions& options, Writer& writer, Figur
   return flush();
 }
 
+// --- More than one bounce, and what is open ------------------------------------------------------
+
+constexpr std::array<uint32_t, 3> kBounces = {1, 2, 8};
+
+absl::StatusOr<Film> RenderBox(const FiguresOptions& options, const RenderSettings& settings,
+                               Executor& executor) {
+  const Scene scene = MakeCornellBox();
+  FP_ASSIGN_OR_RETURN(const LoadedFrame loaded,
+                      LoadFrame(scene, scene.cameras.front(), options.side_px, options.side_px,
+                                settings, nullptr, executor));
+  FP_ASSIGN_OR_RETURN(RenderedFrame rendered, RenderByTiles(loaded.frame, settings, executor));
+  return std::move(rendered.film);
+}
+
+absl::Status DrawLight(const FiguresOptions& options, Writer& writer, const Log& log) {
+  Executor executor(options.threads);
+  std::vector<Picture> parts;
+  float white = 0;
+  for (const uint32_t bounces : kBounces) {
+    log(absl::StrFormat("bounces %d", bounces));
+    RenderSettings settings;
+    settings.bounces = bounces;
+    settings.seed = options.seed;
+    settings.layers = {Layer::kBeauty};
+    FP_ASSIGN_OR_RETURN(const Film film, RenderBox(options, settings, executor));
+    if (parts.empty()) white = LuminanceQuantile(film, Layer::kBeauty, 0.95);
+    parts.push_back(ColourPicture(film, Layer::kBeauty, white));
+  }
+  FP_RETURN_IF_ERROR(writer.Write("bounces.png", SideBySide(parts)));
+  parts.clear();
+  for (const Integrator integrator : {Integrator::kFpbgi, Integrator::kPt}) {
+    log("ambient occlusion, " + std::string(NameOf(integrator)));
+    RenderSettings settings;
+    settings.integrator = integrator;
+    settings.paths = options.paths;
+    settings.seed = options.seed;
+    settings.layers = {Layer::kAmbientOcclusion};
+    FP_ASSIGN_OR_RETURN(const Film film, RenderBox(options, settings, executor));
+    Picture picture = Blank(options.side_px, options.side_px, 0);
+    for (int y = 0; y < options.side_px; ++y) {
+      for (int x = 0; x < options.side_px; ++x) {
+        SetPixel(picture, x, y, Rgb(film.Get(Layer::kAmbientOcclusion, 0, x, y)));
+      }
+    }
+    parts.push_back(std::move(picture));
+  }
+  return writer.Write("ambient-occlusion.png", SideBySide(parts));
+}
+
 }  // namespace
 
 absl::StatusOr<FiguresReport> RunFigures(const FiguresOptions& options, const std::string& folder,
@@ -560,6 +609,7 @@ absl::StatusOr<FiguresReport> RunFigures(const FiguresOptions& options, const st
   Writer writer(folder, report);
   FP_RETURN_IF_ERROR(DrawMethod(report.options, writer, log));
   FP_RETURN_IF_ERROR(DrawParameters(report.options, writer, report, log));
+  FP_RETURN_IF_ERROR(DrawLight(report.options, writer, log));
   return report;
 }
 

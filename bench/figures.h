@@ -1,5 +1,5 @@
-// The pictures of docs/how-it-works.md and docs/parameters.md, made by the product's own parts, so
-// that they can be made again: docs/benchmarks.md.
+// The pictures of docs/how-it-works.md, docs/parameters.md and docs/more-light.md, made by the
+// product's own parts, so that they can be made again: docs/benchmarks.md.
 #pragma once
 
 #include <cstdint>

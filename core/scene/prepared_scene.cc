@@ -448,7 +448,7 @@ class Builder {
     if (!(std::fabs(source.normal_scale) <= kMaxUvFactor)) {
       return fail("normal scale beyond 1e10; correct it");
     }
-    if (source.metallic > 0 || source.roughness < 1) {
+    if (source.metallic > 0 || source.roughness < 1 || source.metal_roughness_texture.present()) {
       m.glossy = 1;
       m.metallic = source.metallic;
       m.roughness = source.roughness;

@@ -24,7 +24,7 @@ TEST(Figures, AreWrittenWithTheirErrorsAndTimes) {
               testing::ElementsAre("surfels.png", "clusters.png", "cut.png", "microbuffers.png",
                                    "layers.png", "parameter-quality.png", "parameter-clusters.png",
                                    "parameter-epsilon.png", "parameter-microbuffer.png",
-                                   "parameter-points.png"));
+                                   "parameter-points.png", "bounces.png", "ambient-occlusion.png"));
   for (const std::string& file : report->files) {
     EXPECT_GT(std::filesystem::file_size(folder.path() / file), 500u) << file;
   }

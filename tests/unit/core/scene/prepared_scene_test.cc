@@ -806,6 +806,13 @@ TEST(PreparedGloss, TexturesMultiplyMetalAndRoughness) {
   const MicrofacetMaterial at = PrepareGlossy(scene)->MicrofacetAt(0, 0.3f, 0.3f);
   EXPECT_FLOAT_EQ(at.roughness, 0.2f);
   EXPECT_FLOAT_EQ(at.metallic, 0.4f);
+  // A texture alone makes gloss of factors that have none.
+  m.metallic = 0;
+  const Prepared dielectric = PrepareGlossy(scene);
+  ASSERT_TRUE(dielectric->IsGlossy(0));
+  EXPECT_FLOAT_EQ(dielectric->MicrofacetAt(0, 0.3f, 0.3f).roughness, 0.2f);
+  EXPECT_EQ(dielectric->MicrofacetAt(0, 0.3f, 0.3f).metallic, 0);
+  ASSERT_TRUE(PreparedScene::FromBlob(dielectric->blob()).ok());
   // Lambert scenes do not decode it.
   EXPECT_EQ(PrepareOk(scene)->textures().size(), 0u);
 }
