@@ -454,7 +454,7 @@ struct CrowdRun {
 absl::StatusOr<CrowdRun> RunCrowd(const ServiceContext& context, int workers, int think_ms,
                                   int tiles) {
   FP_ASSIGN_OR_RETURN(const auto farm, ServiceFarm::Create(context.programs));
-  FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warning"}));
+  FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warn"}));
   Executor executor(1);
   FP_ASSIGN_OR_RETURN(const Digest fingerprint, ComputeFingerprint(executor));
   FP_ASSIGN_OR_RETURN(const JobId job, farm->Submit({.width = 100 * 32,
@@ -521,7 +521,7 @@ absl::Status RunLoad(const ServiceContext& context, ServiceResult& result) {
   }
   {
     FP_ASSIGN_OR_RETURN(const auto farm, ServiceFarm::Create(context.programs));
-    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warning"}));
+    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warn"}));
     const int side = context.Pick(320, 40);
     FP_ASSIGN_OR_RETURN(const JobId job, farm->Submit({.width = side * 32,
                                                        .height = side * 32,
@@ -541,7 +541,7 @@ absl::Status RunLoad(const ServiceContext& context, ServiceResult& result) {
     // In memory, so that the time to make them is not that of the disk: a listing reads no disk.
     const std::string memory = ::access("/dev/shm", W_OK) == 0 ? "/dev/shm" : "";
     FP_ASSIGN_OR_RETURN(const auto farm, ServiceFarm::Create(context.programs, memory));
-    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warning"}));
+    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warn"}));
     const int jobs = context.Pick(10000, 200);
     for (int i = 0; i < jobs; ++i) {
       FP_RETURN_IF_ERROR(
@@ -564,7 +564,7 @@ absl::Status RunLoad(const ServiceContext& context, ServiceResult& result) {
     Figure(result, "ms to list them (the worst of ten)", 1000 * worst);
     farm->server()->Kill();
     const Stopwatch watch;
-    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warning"}));
+    FP_RETURN_IF_ERROR(farm->StartServer({"--log-level", "warn"}));
     Figure(result, "s to start again with them", watch.seconds());
   }
   return absl::OkStatus();
